@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem import Load
-from dpl.fem.rom.stiffness_interpolation import check_terms
+from dpl.fem.rom.stiffness_iteration import check_terms
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.models.linear_response import LinearResponse
 from dpl.scene import Scene
@@ -55,7 +55,7 @@ class LinearBase:
         """Take the scene.
 
         Raises:
-            ValueError: The linear solution is not known for all parameters, see `check_terms`.
+            ValueError: K(0) changes too much with the parameters, see `check_terms`.
         """
         self._scene, self._problem = scene, scene.problem
         check_terms(StiffnessTerms.of(scene.problem))

@@ -7,11 +7,23 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dpl.fem.linear.condensation import Condensed, condense, condensed_block_solve
 from dpl.fem.materials.material import Material
-from dpl.fem.rom.compiled_prediction import LawWeights, LinearPrediction
-from dpl.fem.rom.stiffness_interpolation import StiffnessInterpolation, check_terms
+from dpl.fem.rom.compiled_prediction import (
+    IterationArrays,
+    LawEntries,
+    LawWeights,
+    LinearPrediction,
+)
+from dpl.fem.rom.iterated_inverse import IteratedInverse
+from dpl.fem.rom.stiffness_interpolation import StiffnessInterpolation
+from dpl.fem.rom.stiffness_iteration import (
+    StiffnessIteration,
+    TermMatrices,
+    count_steps,
+)
 from dpl.fem.solvers.condensed_layers import CondensedLayers
 from dpl.fem.solvers.parity_factor import OrbitForm
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
@@ -29,7 +41,8 @@ class LinearResponse:
     reflections of the body (`dpl.fem.linear.condensation`). A solution is a sequence of products
     with them, the same for every load: there is no basis that a load on a small area could miss.
     If the law has ranges, K(0)^-1 is a sum of the inverses for a few parameters
-    (`StiffnessInterpolation`).
+    (`StiffnessInterpolation`). If K(0) has three or more terms, the inverse for one parameter is
+    the preconditioner of a fixed number of steps of conjugate gradients (`StiffnessIteration`).
 
     The blocks depend on the scene only and are computed when they are first used.
     """
@@ -38,10 +51,11 @@ class LinearResponse:
         """Take the scene and the symmetries of the body.
 
         Raises:
-            ValueError: K(0) depends on the parameters in more ways than can be interpolated.
+            ValueError: K(0) changes too much with the parameters, see `StiffnessIteration`.
         """
         self._scene, self._group = scene, group
-        check_terms(self.terms)
+        if self.is_iterated:
+            self.iteration  # noqa: B018  # computed and kept
         self._on_device: dict[torch.device, _Tensors] = {}
 
     # ------------------------------------------------------------------ blocks
@@ -51,9 +65,19 @@ class LinearResponse:
         """Terms of K(0) of the body."""
         return StiffnessTerms.of(self._scene.problem.without_ranged_loads)
 
+    @property
+    def is_iterated(self) -> bool:
+        """True if K(0) has three or more terms, so that each solution takes several steps."""
+        return len(self.terms) > 2
+
+    @cached_property
+    def iteration(self) -> StiffnessIteration:
+        """Parameter for which K(0) is condensed if it has three or more terms."""
+        return StiffnessIteration.of_terms(self.terms)
+
     @cached_property
     def interpolation(self) -> StiffnessInterpolation:
-        """Weights of the parameters for which K(0) is condensed."""
+        """Weights of the parameters for which K(0) is condensed if it has one or two terms."""
         return StiffnessInterpolation.of_terms(self.terms)
 
     @cached_property
@@ -62,12 +86,13 @@ class LinearResponse:
 
     @cached_property
     def blocks(self) -> Condensed:
-        """Blocks of K nodes of the interpolation and M parities, values (K M, V) in float32.
+        """Blocks of K nodes and M parities, values (K M, V) in float32.
 
         They are float64 if the solutions of random forces lose more than `MAX_ROUNDING`.
         """
-        bodies, nodes = [self._scene.problem.reference], self.interpolation.nodes
-        if len(nodes) > 1:
+        bodies = [self._scene.problem.reference]
+        nodes = (self.iteration.node,) if self.is_iterated else self.interpolation.nodes
+        if self.is_iterated or len(nodes) > 1:
             laws = [self.terms.body(torch.tensor(one).double()).material for one in nodes]
             bodies = [bodies[0].with_material(law) for law in laws]
         matrices = [matrix for one in bodies for matrix in self._form.matrices(one)]
@@ -76,20 +101,33 @@ class LinearResponse:
         return rounded if _difference(rounded, exact) < MAX_ROUNDING else exact
 
     @cached_property
+    def iterated(self) -> IteratedInverse:
+        """The solutions if K(0) has three or more terms."""
+        matrices = TermMatrices.of(self.terms, self._form)
+        steps = count_steps(self.iteration, self.terms, self._form, self.blocks, matrices)
+        return IteratedInverse(self.blocks, matrices, steps)
+
+    @cached_property
     def _supports(self) -> Tensor:
         return self.terms.support_forces()
 
     def compiled(self) -> LinearPrediction:
         """Return the linear solution as a part of a compiled prediction."""
-        shape = len(self.interpolation.nodes), len(self._form.parities.members), -1
-        values = self.blocks.values.reshape(shape)
-        return LinearPrediction(self.blocks.fronts, values, self._supports)
+        values = self.blocks.values
+        blocks = values.reshape(-1, len(self._form.parities.members), values.shape[1])
+        found = LinearPrediction(self.blocks.fronts, blocks, self._supports)
+        if not self.is_iterated:
+            return found
+        first_entry, columns, _ = self.iterated.matrices
+        return found._replace(iteration=IterationArrays(first_entry, columns, self.iterated.steps))
 
-    def law_weights(self, law: Material) -> LawWeights:
+    def law_weights(self, law: Material) -> LawWeights | LawEntries:
         """Return the numbers of a law that `compiled` needs; its moduli are numbers."""
         factors = self.terms.factors(law)
-        weights = self.interpolation.weights(factors)[0]
-        return LawWeights(weights.numpy(), np.array([*factors[0].tolist(), 1.0]))
+        moduli = np.array([*factors[0].tolist(), 1.0])
+        if self.is_iterated:
+            return LawEntries(moduli, self.iterated.matrices.at(moduli))
+        return LawWeights(self.interpolation.weights(factors)[0].numpy(), moduli)
 
     # ------------------------------------------------------------------ solution
 
@@ -117,13 +155,19 @@ class LinearResponse:
         size = loaded.abs().amax(dim=1, keepdim=True)
         size = torch.where(size > 0, size, 1.0)  # of order one, so that float32 holds it
         scaled = (loaded / size).to(own.scales)
-        weights = self.interpolation.weights(factors).to(scaled)  # (B, K)
         parts = own.characters @ (own.scales * scaled[:, own.images])  # (B, M, m)
-        count = weights.shape[1]
-        solved = own.layers.solve(parts.transpose(0, 1).repeat(count, 1, 1))  # (K M, B, m)
-        solved = torch.einsum("kmbj,bk->bmj", solved.unflatten(0, (count, -1)), weights)
+        solved = self._by_parity(own.layers, parts, factors)
         values = own.signs * (own.characters.T @ solved)
         return values.flatten(1)[:, own.places].to(loaded) * size
+
+    def _by_parity(self, layers: CondensedLayers | None, parts: Tensor, factors: Tensor) -> Tensor:
+        """Return solutions of forces by parity, (B, M, m), for factors (B, T)."""
+        if layers is None:
+            return self.iterated(parts, pad(factors, (0, 1), value=1.0).double())
+        weights = self.interpolation.weights(factors).to(parts)  # (B, K)
+        count = weights.shape[1]
+        solved = layers.solve(parts.transpose(0, 1).repeat(count, 1, 1))  # (K M, B, m)
+        return torch.einsum("kmbj,bk->bmj", solved.unflatten(0, (count, -1)), weights)
 
     def _tensors(self, device: torch.device) -> "_Tensors":
         if device not in self._on_device:
@@ -132,8 +176,8 @@ class LinearResponse:
 
     def _make_tensors(self, device: torch.device) -> "_Tensors":
         parities, orbits, _ = self._form
-        layers = CondensedLayers.of(self.blocks, device)
-        dtype = layers.layers[0].inverse.dtype
+        layers = None if self.is_iterated else CondensedLayers.of(self.blocks, device)
+        dtype = torch.float64 if layers is None else layers.layers[0].inverse.dtype
         signs, characters = orbits.sign.to(dtype), parities.characters.to(dtype)
         free = self._scene.problem.free.cpu()
         places = torch.empty(int(free.sum()), dtype=torch.int64)
@@ -154,7 +198,7 @@ class _Tensors(NamedTuple):
     """Tensors of the linear solution on one device.
 
     Attributes:
-        layers: Blocks of K(0).
+        layers: Blocks of K(0); None if its solutions are iterated.
         images, signs: Degrees of freedom of the orbits and their signs, (M, m).
         scales: Signs times weights of the orbits, (M, m).
         characters: Factor of each parity under each symmetry, (M, M).
@@ -163,7 +207,7 @@ class _Tensors(NamedTuple):
             if they are zero.
     """
 
-    layers: CondensedLayers
+    layers: CondensedLayers | None
     images: Tensor
     signs: Tensor
     scales: Tensor

@@ -10,6 +10,7 @@ from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.rom.compiled_prediction import (
     CompiledPrediction,
     LawArguments,
+    LawEntries,
     LawWeights,
     law_arguments,
 )
@@ -28,7 +29,7 @@ from dpl.system.threads import on_threads
 
 CELL_STATES = 256  # states at which the cells of a correction are chosen
 MAX_SIZE = 100_000  # of rank, cells and stages
-_AtLaw = tuple[LawArguments, ReducedInverse, LawWeights]
+_AtLaw = tuple[LawArguments, ReducedInverse, LawWeights | LawEntries]
 
 
 class Unrolled(nn.Module):
@@ -191,7 +192,9 @@ class Unrolled(nn.Module):
 
     def _prepare(self) -> None:
         """Prepare what a traced graph takes as constants, after the buffers have changed."""
-        self._stiffness = ReducedStiffness(self.stiffness.detach().cpu().clone()).prepared()
+        iteration = self.linear.iteration if self.linear.is_iterated else None
+        parts = self.stiffness.detach().cpu().clone()
+        self._stiffness = ReducedStiffness(parts, iteration).prepared()
         self._law_of_samples = self.scene.problem.material.of_cells(self.cells.cpu()).centred()
 
     def _at_free_dofs(self, coordinates: Tensor) -> Tensor:
@@ -246,7 +249,8 @@ class Unrolled(nn.Module):
             return last[1]
         of_cells = one_law(law.of_cells(self.cells[self._prediction.cells]).centred())
         reduced = self._stiffness.inverse(self.linear.terms.factors(law))
-        arguments = law_arguments(cast("InvariantBasedMaterial", of_cells))
+        isotropic = cast("InvariantBasedMaterial", of_cells)
+        arguments = law_arguments(isotropic, iterated=self.linear.is_iterated)
         found = arguments, reduced, self.linear.law_weights(law)
         self._at_last_law = (self.stiffness, law), found
         return found

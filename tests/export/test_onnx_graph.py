@@ -27,7 +27,16 @@ from dpl.export.folder import read_raw
 from dpl.export.metadata import describe
 from dpl.export.onnx_graph import missing_packages
 from dpl.export.reference import solve_reference
-from dpl.fem import Load, rectangle, solve, surface
+from dpl.fem import (
+    ConstantFibres,
+    FibreReinforced,
+    Guccione,
+    Load,
+    NeoHookeanIsoK2,
+    rectangle,
+    solve,
+    surface,
+)
 from dpl.fem.postprocess import triangles
 from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
 from dpl.training import MSE, Surrogate
@@ -52,6 +61,12 @@ def make_surrogate(make, scene, seed=0, **options):
         samples = Sample(load.force, truth, load.young, load.parameters)
         surrogate.net.fit(samples, samples)
     return surrogate.eval()
+
+
+def fibres_in_a_matrix(poisson):
+    """Return a law with three ranges, in which K(0) has three terms."""
+    matrix = NeoHookeanIsoK2([poisson, 0.4], [0.5, 2.0])
+    return FibreReinforced(matrix, Guccione([0.1, 1.0], 8.0, 2.0, 4.0), ConstantFibres([2, 1, 0]))
 
 
 NETWORKS = {
@@ -87,10 +102,15 @@ NETWORKS = {
         {},
     ),
     "unrolled, poisson": (Unrolled, {"rank": 8, "cells": 8, "stages": 1}, {"poisson": [0.2, 0.4]}),
+    "unrolled, three terms": (
+        Unrolled,
+        {"rank": 8, "cells": 8, "stages": 1},
+        {"law": fibres_in_a_matrix, "deflection": 0.02},
+    ),
 }
 
 
-RARE = {"fcnn, poisson", "cnn, immersed", "gnn, poisson"}
+RARE = {"fcnn, poisson", "cnn, immersed", "gnn, poisson", "unrolled, three terms"}
 EVERY = [pytest.param(one, marks=pytest.mark.slow) if one in RARE else one for one in NETWORKS]
 
 
@@ -124,7 +144,15 @@ def test_onnx_and_torch_agree_for_all_kinds_of_loads_and_batch_sizes(make_graph,
     assert max(row.max_error for row in rows) < 1e-5
 
 
-@pytest.mark.parametrize("name", ["unrolled", "unrolled, poisson", "fcnn, linear base"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "unrolled",
+        "unrolled, poisson",
+        pytest.param("unrolled, three terms", marks=pytest.mark.slow),
+        "fcnn, linear base",
+    ],
+)
 def test_a_small_force_on_a_node_has_its_linear_solution(make_graph, name):
     """No basis has to represent the displacement near the force."""
     graph, path = make_graph(name)

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
+from dpl.fem.assembly import iterated_prediction_loops
+from dpl.fem.assembly.iterated_prediction_loops import IterationArrays, predict_iterated
 from dpl.fem.assembly.kernels import call_compiled, constants_of
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.prediction_loops import (
@@ -40,17 +42,21 @@ class LawArguments(NamedTuple):
     finite: float
 
 
-def law_arguments(law: InvariantBasedMaterial) -> LawArguments:
+def law_arguments(law: InvariantBasedMaterial, *, iterated: bool = False) -> LawArguments:
     """Return a law as the arguments of a compiled loop.
 
-    The law belongs to the sample cells in the order of the loop. Its constants are followed by mu
-    and lambda, (1, n + 2) or (C, n + 2).
+    Its constants are followed by mu and lambda, (1, n + 2) or (C, n + 2).
+
+    Args:
+        law: The law of the sample cells in the order of the loop.
+        iterated: True for the loops of iterated linear solutions.
     """
+    sources = iterated_prediction_loops.SOURCES if iterated else SOURCES
     rows = [constants_of(law)[0], *(np.reshape(one, (-1, 1)) for one in (law.mu, law.lam))]
     count = max(map(len, rows))
     constants = np.concatenate([np.broadcast_to(row, (count, row.shape[1])) for row in rows], 1)
     terms = required_terms(law), float(law.finite)
-    return LawArguments(Law.of(law, SOURCES), constants, *terms)
+    return LawArguments(Law.of(law, sources), constants, *terms)
 
 
 @dataclass(frozen=True)
@@ -60,10 +66,12 @@ class CompiledPrediction:
     Attributes:
         arrays: Its matrices.
         cells: Position among the sample cells of each cell of the loops, (C,).
+        iteration: Structure of K(0) if linear solutions are iterated.
     """
 
     arrays: ModelArrays
     cells: Tensor
+    iteration: IterationArrays | None
 
     @classmethod
     def of(
@@ -132,13 +140,13 @@ class CompiledPrediction:
             ),
         )
         blocks = one.images.unflatten(1, (-1, 9, SIMD_WIDTH))
-        return cls(arrays, blocks[:, :, 0].flatten() // dim**2)
+        return cls(arrays, blocks[:, :, 0].flatten() // dim**2, linear.iteration)
 
     def __call__(
         self,
         law: LawArguments,
         reduced: ReducedInverse,
-        of_law: "LawWeights",
+        of_law: "LawWeights | LawEntries",
         force: Array,
         field: Array,
     ) -> None:
@@ -152,8 +160,11 @@ class CompiledPrediction:
             field: Displacement, (N, D), contiguous.
         """
         flat = np.ascontiguousarray(force).reshape(-1)
-        data = self.arrays, reduced, of_law, flat, field.reshape(-1)
-        call_compiled(predict, *law, *data)
+        data = reduced, of_law, flat, field.reshape(-1)
+        if self.iteration is None:
+            call_compiled(predict, *law, self.arrays, *data)
+        else:
+            call_compiled(predict_iterated, *law, self.arrays, self.iteration, *data)
 
 
 class LinearPrediction(NamedTuple):
@@ -161,17 +172,19 @@ class LinearPrediction(NamedTuple):
 
     Attributes:
         fronts: Fronts of K(0).
-        values: Blocks of K nodes of the interpolation, by parity, (K, M, V).
+        values: Blocks of K nodes, by parity, (K, M, V).
         supports: See `StiffnessTerms.support_forces`, (T + 1, N, D).
+        iteration: Structure of K(0) if solutions are iterated; then K = 1.
     """
 
     fronts: Fronts
     values: NDArray[Any]
     supports: Tensor
+    iteration: IterationArrays | None = None
 
 
 class LawWeights(NamedTuple):
-    """A law as a linear solution needs it.
+    """A law as an interpolated linear solution needs it.
 
     Attributes:
         weights: Weights of the nodes, (K,).
@@ -180,6 +193,18 @@ class LawWeights(NamedTuple):
 
     weights: Array
     moduli: Array
+
+
+class LawEntries(NamedTuple):
+    """A law as an iterated linear solution needs it.
+
+    Attributes:
+        moduli: Factors of the terms of K(0), and 1, (T + 1,).
+        entries: Entries of K(0) by parity, (M, nnz).
+    """
+
+    moduli: Array
+    entries: Array
 
 
 class _ByParity:

@@ -60,7 +60,7 @@ class CondensedLayers(NamedTuple):
         solution = torch.zeros_like(force)
         for layer, own in zip(reversed(self.layers), reversed(inner), strict=True):
             outer = solution[..., layer.boundary].transpose(1, 2)
-            found = (own - outer @ layer.coupling.mT).transpose(1, 2).flatten(2)
+            found = (own - outer @ layer.coupling.transpose(2, 3)).transpose(1, 2).flatten(2)
             solution = solution.index_add(2, layer.pivots.flatten(), found)
         return solution[..., :-1]
 

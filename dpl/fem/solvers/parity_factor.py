@@ -48,6 +48,12 @@ class OrbitForm(NamedTuple):
         node = problem.free.nonzero()[orbits.images[0], 0]
         return cls(parities, orbits, problem.points[node].numpy())
 
+    def parts(self, force: Tensor) -> Tensor:
+        """Return the products of a force at free degrees of freedom, (n,), with fields, (M, m)."""
+        parities, orbits, _ = self
+        scales = orbits.sign * orbits.weight
+        return parities.characters @ (scales * force[orbits.images])
+
     def matrices(self, problem: Problem) -> list[csr_array]:
         """Return C^T K(0) C, (m, m), of the fields C of each parity; see `of`."""
         whole = full_matrix(problem.pattern, problem.stiffness_at_rest().numpy())

@@ -14,6 +14,7 @@ from dpl.fem.problem import Problem
 
 SAMPLES = 64  # points of the parameters at which moduli are compared
 INDEPENDENT = 1e-10  # part of the largest modulus below which a direction counts as rounding [-]
+MAX_CELLS = 32  # different cells by which condition numbers are bounded
 MAX_CORNERS = 6  # parameters of which all corners of the ranges are samples
 
 
@@ -96,17 +97,59 @@ class StiffnessTerms:
         """
         if len(self) != 2:
             raise ValueError(f"there are {len(self)} terms; this is known for two")
-        rest = torch.zeros(1, len(self.problem.cells), 1, 3, 3, dtype=torch.float64)
-        A, B = (_matrices(body.material.tangent(rest)[0, :, 0]) for body in self.bodies)
-        inverse = torch.linalg.inv(torch.linalg.cholesky(A))
-        ratios = torch.linalg.eigvalsh(inverse @ B @ inverse.mT)
+        A, B = self.cell_moduli
+        ratios = _ratios(A, B)
         return float(ratios.min()), float(ratios.max())
+
+    @cached_property
+    def cell_moduli(self) -> Tensor:
+        """Moduli at rest of each term in each cell as quadratic forms of strains, (T, E, 6, 6)."""
+        rest = torch.zeros(1, len(self.problem.cells), 1, 3, 3, dtype=torch.float64)
+        return torch.stack([_matrices(b.material.tangent(rest)[0, :, 0]) for b in self.bodies])
+
+    def condition_numbers(self, factors: Tensor, node: Tensor) -> Tensor:
+        """Return bounds of the condition numbers of K(node)^-1 K(0), (S,), for every load.
+
+        An energy is a sum over points, so that the ratio of two energies of a displacement lies
+        between those of the moduli of the cells, strain by strain. Springs have the ratio 1. Of
+        bodies with many different cells, `MAX_CELLS` are taken.
+
+        Args:
+            factors: Factors of K(0), (S, T).
+            node: Factors of the other matrix, (T,).
+        """
+        moduli = self._some_cells
+        of_node = torch.einsum("t,teij->eij", node, moduli)
+        ratios = _ratios(of_node, torch.einsum("st,teij->seij", factors, moduli)).flatten(1)
+        low, high = ratios.amin(dim=1), ratios.amax(dim=1)
+        if self.problem.springs is not None:
+            low, high = low.clamp(max=1.0), high.clamp(min=1.0)
+        return high / low
+
+    @cached_property
+    def _some_cells(self) -> Tensor:
+        """Moduli of the terms in at most `MAX_CELLS` different cells, (T, C, 6, 6)."""
+        moduli = self.cell_moduli.transpose(0, 1).flatten(1)  # (E, T 36)
+        digits = (moduli / moduli.abs().amax() * 1e9).round()
+        _, numbers = digits.unique(dim=0, return_inverse=True)
+        first = torch.full((int(numbers.max()) + 1,), len(numbers))
+        first = first.scatter_reduce(0, numbers, torch.arange(len(numbers)), "amin")
+        if len(first) > MAX_CELLS:
+            order = torch.randperm(len(first), generator=torch.Generator().manual_seed(0))
+            first = first[order[:MAX_CELLS]]
+        return self.cell_moduli[:, first]
 
     @property
     def sampled_factors(self) -> Tensor:
         """Factors at corners and random points of the parameters, (S, T)."""
         law = self.problem.material
         return self.factors(law.with_parameters(_samples(law)))
+
+
+def _ratios(A: Tensor, B: Tensor) -> Tensor:
+    """Return the eigenvalues of B relative to A, (..., 6), of matrices (..., 6, 6)."""
+    inverse = torch.linalg.inv(torch.linalg.cholesky(A))
+    return torch.linalg.eigvalsh(inverse @ B @ inverse.mT)
 
 
 def _matrices(moduli: Tensor) -> Tensor:
