@@ -278,7 +278,7 @@ def test_pressures_add_up(grid):
 
 @pytest.mark.parametrize("value", [float("nan"), [1.0, 0.0], True, "soft"])
 def test_invalid_pressures_are_refused(value, grid):
-    with pytest.raises(ValueError, match=r"value = .* must be .*\[Pa\]"):
+    with pytest.raises(ValueError, match=r"value = .* must be"):
         Problem.build(grid("quad"), NH, follower_loads=[FollowerPressure(END, value)])
 
 

@@ -85,25 +85,28 @@ def add_system(
 
     The constants of the law are (E, n), or (1, n) for all cells, the fibre frames
     (E or 1, Q or 1, 9), or (1, 1, 0) for a law without fibres. `volumes` are the functions of the
-    volume change of mean dilatation, (E or 1, Q, M), with M = 0 without it, and the bulk modulus
-    that stays at the points, (E or 1, 1); see `dpl.fem.assembly.mean_dilatation`.
+    volume change of mean dilatation, (E or 1, Q, M), and the bulk modulus that stays at the points,
+    (E or 1, 1), see `dpl.fem.assembly.mean_dilatation`; None without it: numba then compiles less.
 
     With the gaps (blocks, Q, 6, SIMD_WIDTH) and (blocks, M, SIMD_WIDTH) stress and moduli are
     evaluated at the strain of u minus the first, and pressures at the volume change minus the
     second; both are extrapolated linearly. Returns the minimum of det F - 1, with gaps that of
     det C - 1 of the reduced strains and of the reduced volume changes.
     """
-    (strain_gap, volume_gap), (psi, stays) = gap, volumes
-    n, Q, dim, M = cells.shape[1], dN.shape[1], dN.shape[3], psi.shape[2]
+    strain_gap, volume_gap = gap
+    n, Q, dim = cells.shape[1], dN.shape[1], dN.shape[3]
     mixed, moduli = len(strain_gap) > 0, len(values) > 0
     ue, fe, g, weight = rows(3 * n), rows(3 * n), np.zeros((Q, 3 * n, SIMD_WIDTH)), rows(Q)
     H, P, D, A, C = rows(9), rows(9), rows(36), rows(81), rows(27)
     e, X, S, T, ahead = rows(6), rows(6), rows(6), rows(6), rows(6)
     K, low = rows(places.shape[1]), np.inf
     scratch, constants = rows(point.SCRATCH_ROWS), rows(c.shape[1] + frames.shape[2])
-    functions, slopes = np.zeros((Q, M, SIMD_WIDTH)), np.zeros((M, 3 * n, SIMD_WIDTH))
-    pressures, work, bulk = (rows(M), rows(M), rows(M * M)), (rows(9), rows(M), scratch), rows(1)
-    no_gap, CV = rows(0), rows(3 * n)
+    if volumes is not None:
+        psi, stays = volumes
+        M = psi.shape[2]
+        functions, slopes = np.zeros((Q, M, SIMD_WIDTH)), np.zeros((M, 3 * n, SIMD_WIDTH))
+        pressures, bulk = (rows(M), rows(M), rows(M * M)), rows(1)
+        work, no_gap, CV = (rows(9), rows(M), scratch), rows(0), rows(3 * n)
     for start in range(0, len(cells), SIMD_WIDTH):
         block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
         gather(u, cells, start, count, ue)
@@ -112,7 +115,7 @@ def add_system(
         fe[:] = 0.0
         if moduli:
             K[:] = 0.0
-        if M > 0:
+        if volumes is not None:
             gather_functions(psi, start, count, functions)
             slopes[:] = 0.0
             gather_constants(stays, start, count, bulk)
@@ -133,7 +136,7 @@ def add_system(
             low = minimum(scratch, count, low)
             j = change / (1.0 + sqrt(1.0 + change)) if mixed else change
             point.stress(law, constants, needs, e, j, X, S, scratch, D, moduli)
-            if M > 0:
+            if volumes is not None:
                 own_j = j if finite > 0.0 else point.change_of_volume(H, finite)
                 if finite == 0.0:
                     for v in range(6):
@@ -147,7 +150,7 @@ def add_system(
                 store(ahead, v, load(S, v))
             if mixed:
                 point.extrapolate(D, strain_gap[block, q], ahead)
-            if M > 0:
+            if volumes is not None:
                 if mixed:
                     point.strain(H, finite, e)
                     point.invert(e, X)
@@ -160,12 +163,12 @@ def add_system(
             if moduli:
                 point.push_forward(H, D, S, load(weight, q), finite, T, A)
                 add_stiffness(A, g[q], dim, C, K)
-                if M > 0:
+                if volumes is not None:
                     add_slopes(H, X, J, finite, load(weight, q), functions[q], g[q], P, slopes)
             add_forces(H, ahead, load(weight, q), g[q], P, fe)
         scatter(fe, cells, start, count, force)
         if moduli:
-            if M > 0:
+            if volumes is not None:
                 add_volumetric_stiffness(slopes, pressures[2], dim, CV, K)
             scatter_entries(K, places[block], count, values)
     return low
@@ -175,11 +178,14 @@ def add_system(
 def update_gap(law, gap, length, update, u, cells, dN, dV, psi):
     """Return the gaps of strain and of volume after a step (N, D) to u (N, D), see `add_system`.
 
+    `psi` are the functions of the volume change, (E or 1, Q, M), or None.
+
     They are (1 - length) gap plus what the step changes nonlinearly; that of the strain is
     length^2 dH^T dH.
     """
     strain_gap, volume_gap = gap
-    n, Q, M = cells.shape[1], dN.shape[1], psi.shape[2]
+    n, Q = cells.shape[1], dN.shape[1]
+    M = 0 if psi is None else psi.shape[2]
     blocks = -(-len(cells) // SIMD_WIDTH)
     strains = np.zeros((blocks, Q, 6, SIMD_WIDTH))
     volumes = np.zeros((blocks, M, SIMD_WIDTH))
@@ -189,7 +195,7 @@ def update_gap(law, gap, length, update, u, cells, dN, dV, psi):
         block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
         gather(update, cells, start, count, ue)
         gather_shape(dN, dV, start, count, g, weight)
-        if M > 0:
+        if psi is not None:
             gather(u, cells, start, count, at)
             gather_functions(psi, start, count, functions)
             if len(volume_gap) > 0:
@@ -202,7 +208,7 @@ def update_gap(law, gap, length, update, u, cells, dN, dV, psi):
                     old = load(strain_gap[block, q], v)
                     store(strains[block, q], v, (1.0 - length) * old)
             point.quadratic(H, length * length, strains[block, q])
-            if M > 0:
+            if psi is not None:
                 gradient(at, g[q], deformed)
                 for r in range(9):
                     store(H, r, length * load(H, r))

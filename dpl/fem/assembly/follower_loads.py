@@ -59,8 +59,13 @@ class FollowerLoad:
                 return ParameterRange.of("value", self.value)
             except ValueError as error:
                 raise ValueError(f"{error}; {self.direction_hint}") from error
-        if not isinstance(self.value, int | float) or not math.isfinite(self.value):
-            raise ValueError(f"value = {self.value} must be a finite number or a range [Pa]")
+        value = self.value
+        if (
+            not isinstance(value, int | float)
+            or isinstance(value, bool)
+            or not math.isfinite(value)
+        ):
+            raise ValueError(f"value = {value} must be a finite number or a range [Pa]")
         return None
 
     def dimensionless(self, units: Units) -> float:

@@ -54,8 +54,7 @@ class Kernels:
         self.dV = dV
         self.places = _in_blocks(places)
         has_volumes = functions is not None
-        none = np.zeros((1, dN.shape[1], 0))
-        self.functions = none if functions is None else np.ascontiguousarray(functions)
+        self.functions = None if functions is None else np.ascontiguousarray(functions)
         self._law = (
             Law.of(material, element_loops.SOURCES),
             max(required_terms(material), int(has_volumes and material.finite)),
@@ -66,7 +65,7 @@ class Kernels:
     def _set_constants(self, material: CompiledLaw) -> None:
         self._constants = as_columns(material.constants)
         self._frames = frames_of(material)
-        self._bulk = as_columns([material.point_bulk if self.functions.shape[2] else 0.0])
+        self._bulk = None if self.functions is None else as_columns([material.point_bulk])
 
     def with_moduli(self, materials: Sequence[CompiledLaw]) -> "Kernels":
         """Return the kernels of the same body with other moduli of its one law."""
@@ -97,8 +96,11 @@ class Kernels:
 
     def _add(self, member: int, u: Array, gap: Gap, out: Array, values: Array) -> float:
         law, needs, finite = self._law
-        moduli, bulk = (x[member if len(x) > 1 else 0] for x in (self._constants, self._bulk))
-        body = self.cells, self.dN, self.dV, (self.functions, bulk), self.places
+        moduli = self._constants[member if len(self._constants) > 1 else 0]
+        volumes = None
+        if self._bulk is not None:
+            volumes = self.functions, self._bulk[member if len(self._bulk) > 1 else 0]
+        body = self.cells, self.dN, self.dV, volumes, self.places
         system = element_loops.add_system
         law_arguments = law, moduli, self._frames, needs, finite
         return 1 + call_compiled(system, *law_arguments, u, _both(gap), *body, out, values)
@@ -110,7 +112,7 @@ class Kernels:
         kernel, body = element_loops.update_gap, (self.cells, self.dN, self.dV, self.functions)
         u = np.zeros_like(update) if u is None else u
         both = call_compiled(kernel, self._law[0], _both(gap), length, update, u, *body)
-        found: Gap = both if self.functions.shape[2] else both[0]
+        found: Gap = both[0] if self.functions is None else both
         return found
 
 
@@ -178,7 +180,9 @@ def as_columns(values: Sequence[Any]) -> Array:
 
 PATIENCE = 2.0  # time after which a compilation is announced [s]
 COMPILING = "compiling element kernels for this law, once per machine ..."
-_LOADED: set[tuple[Any, str]] = set()  # kernels and laws compiled or loaded by this process
+_LOADED: set[tuple[Any, str, tuple[bool, ...]]] = (
+    set()
+)  # kernels and laws compiled or loaded by this process
 
 
 def call_compiled(kernel: Any, law: Law, *arguments: Any) -> Any:
@@ -187,7 +191,8 @@ def call_compiled(kernel: Any, law: Law, *arguments: Any) -> Any:
     Two processes that save kernels of different laws at the same time would choose the same file
     name, and one law would then run the code of the other.
     """
-    variant = (kernel, law.kind.name)
+    given = tuple(argument is not None for argument in arguments)  # numba compiles for each
+    variant = (kernel, law.kind.name, given)
     with contextlib.ExitStack() as stack:
         # no lock on other systems, or in a read-only folder, where numba does not save
         with contextlib.suppress(ImportError, OSError):
