@@ -91,6 +91,8 @@ class StiffnessTerms:
 
         An energy is a sum over points, so that the ratio lies between those of the moduli of the
         cells, strain by strain.
+        With mean dilatation the bound is approximate for laws with fibres, whose strain has the
+        volume change of the point and not of the cell.
 
         Raises:
             ValueError: There are not two terms.
