@@ -1,5 +1,7 @@
 """Bodies of several laws: each cell has its own, with and without compiled loops."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import skfem
@@ -10,6 +12,7 @@ from dpl.fem import (
     Box,
     CellField,
     ConstantFibres,
+    FibreFunction,
     FibreReinforced,
     Guccione,
     Heterogeneous,
@@ -257,3 +260,19 @@ def test_a_law_whose_cells_are_not_known_says_so():
 def test_a_field_without_a_number_for_each_cell_is_refused(values):
     with pytest.raises(ValueError, match="must be 24 finite numbers, one for each cell"):
         Problem.build(grid(), NeoHookeanLn(0.3, CellField(np.asarray(values))))
+
+
+@pytest.mark.parametrize("equal", [True, False])
+def test_loops_keep_no_view_of_a_tensor(equal):
+    """Sending a problem to a worker moves the memory of its tensors."""
+    mesh = grid() if equal else skfem.MeshHex(grid().p + 0.01 * grid().p[::-1] ** 2, grid().t)
+    turning = FibreFunction(lambda x: np.stack([1 + 0 * x[:, 0], x[:, 1], x[:, 2]], axis=1))
+    laws = {"core": replace(FIBRES, directions=turning), "other": FIBRES}
+    problem = Problem.build(mesh, laws, regions=LEFT, fixed=Plane(0, "min"), mean_dilatation=True)
+    parts = [law.frames for law in problem.material.parts.values()]
+    tensors = [x for x in problem.__getstate__().values() if isinstance(x, torch.Tensor)]
+    for kernels in problem._compiled._groups:
+        arrays = [x for x in vars(kernels).values() if isinstance(x, np.ndarray)]
+        assert len(arrays) > 5
+        for one in arrays:
+            assert not any(np.shares_memory(one, tensor.numpy()) for tensor in tensors + parts)

@@ -163,12 +163,14 @@ def constants_of(material: CompiledLaw) -> Array:
 
 
 def frames_of(material: CompiledLaw) -> Array:
-    """Return the fibre frames of a law, (E or 1, Q or 1, 9), or (1, 1, 0) without fibres."""
+    """Return the fibre frames of a law, (E or 1, Q or 1, 9), or (1, 1, 0) without fibres.
+
+    They are a copy: sending a problem to a worker moves the memory of its tensors.
+    """
     if not isinstance(material, FibreReinforced):
         return np.zeros((1, 1, 0))
-    frames = material.frames.numpy()
-    frames = frames if frames.ndim == 4 else frames[:, None]
-    return np.ascontiguousarray(frames.reshape(*frames.shape[:2], 9))
+    frames = material.frames if material.frames.ndim == 4 else material.frames[:, None]
+    return frames.flatten(2).contiguous().numpy().copy()
 
 
 def as_columns(values: Sequence[Any]) -> Array:
