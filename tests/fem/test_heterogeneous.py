@@ -7,6 +7,7 @@ import pytest
 import skfem
 import torch
 from laws import LAWS
+from skfem.io.meshio import to_meshio
 
 from dpl.fem import (
     Box,
@@ -28,6 +29,7 @@ from dpl.fem import (
     Tag,
     VolumetricK2,
     YeohK2,
+    read_mesh,
     solve,
     symmetries,
 )
@@ -260,6 +262,24 @@ def test_a_law_whose_cells_are_not_known_says_so():
 def test_a_field_without_a_number_for_each_cell_is_refused(values):
     with pytest.raises(ValueError, match="must be 24 finite numbers, one for each cell"):
         Problem.build(grid(), NeoHookeanLn(0.3, CellField(np.asarray(values))))
+
+
+def test_a_field_may_be_cell_data_of_a_mesh_file(tmp_path):
+    """In the order of the cells that are read."""
+    file, made = str(tmp_path / "body.vtu"), grid()
+    stiffness = 1 + np.random.default_rng(0).random(made.nelements)
+    points = to_meshio(made, encode_cell_data=False)
+    points.cell_data = {"stiffness": [stiffness]}
+    points.write(file)
+    mesh = read_mesh(file)
+    law = NeoHookeanLn(0.3, CellField("stiffness", file))
+    problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
+    np.testing.assert_allclose(problem.material.young[:, 0], stiffness)
+    with pytest.raises(ValueError, match="no cell data 'softness'"):
+        Problem.build(mesh, NeoHookeanLn(0.3, CellField("softness", file)))
+    for wrong in (lambda: CellField("stiffness"), lambda: CellField([1.0], file)):
+        with pytest.raises(ValueError, match="name of cell data if there is a file"):
+            wrong()
 
 
 @pytest.mark.parametrize("equal", [True, False])

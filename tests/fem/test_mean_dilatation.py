@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from laws import ISOTROPIC, LAWS
 from torch.testing import assert_close
 
 from dpl.fem import (
@@ -237,6 +238,26 @@ def test_iterations_do_not_depend_on_the_bulk_modulus(degree):
         counts.append(solution.iterations.item())
     assert max(counts) <= min(counts) + 4
     assert max(counts) <= 9
+
+
+@pytest.mark.parametrize("name", sorted(set(LAWS) - set(ISOTROPIC)))
+def test_laws_with_fibres_converge_near_incompressibility(name):
+    """Bulk over shear modulus of 1e2 and 1e5, from rest and without a load step."""
+    law, found = LAWS[name], []
+    mu = law.mu.item()
+    for ratio in (1e2, 1e5):
+        nearly = {"poisson": poisson(ratio)} if hasattr(law.matrix, "poisson") else {}
+        stiff = replace(law, matrix=replace(law.matrix, **(nearly or {"bulk": ratio * mu})))
+        problem = Problem.build(
+            box([4.0, 1.0, 1.0], [5, 2, 2]), stiff, fixed=Plane(0, "min"), degree=2, length=1.0,
+            mean_dilatation=True, follower_loads=[FollowerPressure(Plane(2, "max"), 0.01 * mu)],
+        )  # fmt: skip
+        solution = solved(problem, tol=1e-6)
+        assert solution.converged.item()
+        assert solution.iterations.item() <= 10
+        found.append(solution.displacement.abs().max().item())
+    assert found[0] == pytest.approx(found[1], rel=0.02)
+    assert found[1] > 0.5
 
 
 def muscle(bulk: float, **options) -> Problem:
