@@ -6,6 +6,7 @@ import torch
 from dpl.data import OfflineData, OnlineData
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.fem import Load, Problem, solve
+from dpl.fem.assembly import element_loops
 from dpl.fem.linear import SuperLU
 from dpl.models import FCNN
 from dpl.training import MSE, LrPlus, LrStar, Surrogate
@@ -73,6 +74,21 @@ def test_rest_stiffness_is_factorised_once_for_modes_answers_and_first_steps(mak
     assert says(
         scene, "K(0) factorised once for modes, linear solutions and every first Newton step"
     )
+
+
+def test_one_law_without_fibres_has_nothing_of_its_cells(make_scene, monkeypatch):
+    """One pass of the loops with the constants of all cells; no frames, no volume functions."""
+    passes, original = [], element_loops.add_system
+
+    def counted(law, constants, frames, *rest):
+        passes.append((constants.shape[0], frames.size, rest[7]))
+        return original(law, constants, frames, *rest)
+
+    counted.stats = original.stats
+    monkeypatch.setattr(element_loops, "add_system", counted)
+    scene = make_scene()
+    scene.problem.evaluate(torch.zeros(1, *scene.problem.shape, dtype=torch.float64))
+    assert passes == [(1, 0, None)]
 
 
 def test_pattern_and_ordering_are_analysed_once(make_scene, calls, monkeypatch):
