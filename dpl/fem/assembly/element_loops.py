@@ -29,7 +29,6 @@ from dpl.fem.assembly.volume_loops import (
     add_projected,
     add_slopes,
     add_volumetric_stiffness,
-    gather_functions,
     pressures_of_cells,
     value_of,
 )
@@ -104,6 +103,7 @@ def add_system(
     if volumes is not None:
         psi, stays = volumes
         M = psi.shape[2]
+        rows_of_psi = psi.reshape((len(psi), Q * M))
         functions, slopes = np.zeros((Q, M, SIMD_WIDTH)), np.zeros((M, 3 * n, SIMD_WIDTH))
         pressures, bulk = (rows(M), rows(M), rows(M * M)), rows(1)
         work, no_gap, CV = (rows(9), rows(M), scratch), rows(0), rows(3 * n)
@@ -116,7 +116,7 @@ def add_system(
         if moduli:
             K[:] = 0.0
         if volumes is not None:
-            gather_functions(psi, start, count, functions)
+            gather_constants(rows_of_psi, start, count, functions.reshape((Q * M, SIMD_WIDTH)))
             slopes[:] = 0.0
             gather_constants(stays, start, count, bulk)
             own, points = volume_gap[block] if mixed else no_gap, (ue, g, weight)
@@ -186,6 +186,8 @@ def update_gap(law, gap, length, update, u, cells, dN, dV, psi):
     strain_gap, volume_gap = gap
     n, Q = cells.shape[1], dN.shape[1]
     M = 0 if psi is None else psi.shape[2]
+    if psi is not None:
+        rows_of_psi = psi.reshape((len(psi), Q * M))
     blocks = -(-len(cells) // SIMD_WIDTH)
     strains = np.zeros((blocks, Q, 6, SIMD_WIDTH))
     volumes = np.zeros((blocks, M, SIMD_WIDTH))
@@ -197,7 +199,7 @@ def update_gap(law, gap, length, update, u, cells, dN, dV, psi):
         gather_shape(dN, dV, start, count, g, weight)
         if psi is not None:
             gather(u, cells, start, count, at)
-            gather_functions(psi, start, count, functions)
+            gather_constants(rows_of_psi, start, count, functions.reshape((Q * M, SIMD_WIDTH)))
             if len(volume_gap) > 0:
                 for m in range(M):
                     store(volumes[block], m, (1.0 - length) * load(volume_gap[block], m))

@@ -53,11 +53,10 @@ class Kernels:
         self.dN = dN
         self.dV = dV
         self.places = _in_blocks(places)
-        has_volumes = functions is not None
         self.functions = None if functions is None else np.ascontiguousarray(functions)
         self._law = (
             Law.of(material, element_loops.SOURCES),
-            max(required_terms(material), int(has_volumes and material.finite)),
+            max(required_terms(material), int(functions is not None and material.finite)),
             float(material.finite),
         )
         self._set_constants(material)
@@ -81,7 +80,7 @@ class Kernels:
             out: Internal force, (N, D).
             member: Index of the moduli, where each member of a batch has its own.
         """
-        return self._add(member, u, NO_GAP, out, NO_VALUES)
+        return self._add(member, u, None, out, NO_VALUES)
 
     def system(self, u: Array, gap: Gap | None, out: Array, values: Array) -> float:
         """Add force (N, D) and tangent (nnz + 1,) at u; return min det C of mixed points.
@@ -91,10 +90,10 @@ class Kernels:
         """
         if len(self._constants) > 1:
             raise ValueError("parameters must be the same for all loads; linearise them one by one")
-        lowest = self._add(0, u, NO_GAP if gap is None else gap, out, values)
+        lowest = self._add(0, u, gap, out, values)
         return math.inf if gap is None else lowest
 
-    def _add(self, member: int, u: Array, gap: Gap, out: Array, values: Array) -> float:
+    def _add(self, member: int, u: Array, gap: Gap | None, out: Array, values: Array) -> float:
         law, needs, finite = self._law
         moduli = self._constants[member if len(self._constants) > 1 else 0]
         volumes = None
@@ -182,9 +181,8 @@ def as_columns(values: Sequence[Any]) -> Array:
 
 PATIENCE = 2.0  # time after which a compilation is announced [s]
 COMPILING = "compiling element kernels for this law, once per machine ..."
-_LOADED: set[tuple[Any, str, tuple[bool, ...]]] = (
-    set()
-)  # kernels and laws compiled or loaded by this process
+# kernels, laws and given arguments that this process has compiled or loaded
+_LOADED: set[tuple[Any, str, tuple[bool, ...]]] = set()
 
 
 def call_compiled(kernel: Any, law: Law, *arguments: Any) -> Any:

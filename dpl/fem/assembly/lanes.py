@@ -27,9 +27,9 @@ def gather(field, cells, start, count, out):
 
 @njit
 def gather_constants(c, start, count, out):
-    """Copy the constants of a block of cells from c (E, n) to `out`, (n, SIMD_WIDTH).
+    """Copy the constants of a block of cells, or other numbers, from c (E, n) to (n, SIMD_WIDTH).
 
-    Constants of all cells (1, n) are copied for the first block only.
+    Those of all cells (1, n) are copied for the first block only.
     """
     several = c.shape[0] > 1
     if not several and start > 0:

@@ -8,20 +8,7 @@ from numba import njit
 
 from dpl.fem.assembly import constitutive_kernels as point
 from dpl.fem.assembly.lanes import gradient, minimum
-from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
-
-
-@njit
-def gather_functions(psi, start, count, out):
-    """Copy the functions of the volume change, (E or 1, Q, M), to out (Q, M, lane)."""
-    several = psi.shape[0] > 1
-    if not several and start > 0:
-        return
-    for lane in range(SIMD_WIDTH):
-        cell = start + min(lane, count - 1) if several else 0
-        for q in range(psi.shape[1]):
-            for m in range(psi.shape[2]):
-                out[q, m, lane] = psi[cell, q, m]
+from dpl.fem.assembly.simd import load, store
 
 
 @njit
