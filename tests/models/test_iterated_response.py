@@ -2,12 +2,12 @@
 
 import pytest
 import torch
+from linear_solutions import BEAM, LEFT, SUPPORTS, at_free, exact, relative
 
 from dpl import Sample, Scene
 from dpl.fem import (
     Box,
     ConstantFibres,
-    DirichletBC,
     FibreReinforced,
     Guccione,
     Load,
@@ -15,10 +15,7 @@ from dpl.fem import (
     NeoHookeanIsoK2,
     NeoHookeanLn,
     Newton,
-    Plane,
     Problem,
-    RobinBC,
-    box,
     solve,
     symmetries,
 )
@@ -26,16 +23,9 @@ from dpl.models import FCNN, LinearBase, Unrolled, linear_response
 from dpl.models.linear_response import LinearResponse
 from dpl.training import RMSELoss, Surrogate
 
-BEAM = box((4, 1, 1), (7, 4, 4))
-LEFT = Plane(0, 0.0)
 REGIONS = {"core": Box([1.0, 0.2, 0.2], [3.0, 0.8, 0.8])}
 ENDS = [-1.0, 0.7, 1.4, 2.7, 5.0]
 SLICES = {f"part{k}": Box([ENDS[k], -1, -1], [ENDS[k + 1], 2, 2]) for k in range(4)}
-SUPPORTS = {
-    "held": [DirichletBC(LEFT)],
-    "moved": [DirichletBC(LEFT), DirichletBC(Plane(0, 4.0), value=[0.05, None, None])],
-    "on a foundation": [DirichletBC(LEFT), RobinBC(Plane(2, 0.0), 0.1)],
-}
 FIBRES = FibreReinforced(
     NeoHookeanIsoK2([0.3, 0.45], [0.5, 2.0]),
     Guccione([0.1, 1.0], 8.0, 2.0, 4.0),
@@ -103,25 +93,6 @@ def parameters(scene, count=9):
     values = torch.rand(count, len(ranges), generator=random, dtype=torch.float64)
     values[::2] = values[::2].round()
     return torch.stack([one.at(t) for one, t in zip(ranges, values.T, strict=True)], dim=1)
-
-
-def exact(scene, force, own):
-    """Return displacements K(0)^-1 (f - s) plus the prescribed ones, (B, N, D)."""
-    fields = []
-    for one, values in zip(force, own, strict=True):
-        body = scene.problem.with_parameters(values[None])
-        moved = body.tangent_product(torch.zeros_like(one)[None], body.prescribed[None])[0]
-        solver = scene.linear.with_parameters(values[None])
-        fields.append(solver.solve(torch.where(body.free, one - moved, 0.0)) + body.prescribed)
-    return torch.stack(fields)
-
-
-def relative(found, expected):
-    return float(((found - expected).norm(dim=1) / expected.norm(dim=1)).max())
-
-
-def at_free(scene, fields):
-    return fields[:, scene.problem.free]
 
 
 @pytest.mark.parametrize("group", [True, False], ids=["by parity", "whole"])

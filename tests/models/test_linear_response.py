@@ -4,30 +4,19 @@ from functools import partial
 
 import pytest
 import torch
+from linear_solutions import BEAM, SUPPORTS, at_free, exact, relative
 
 from dpl import Sample, Scene
 from dpl.fem import (
-    DirichletBC,
     ModalLoads,
     NeoHookeanLn,
     Newton,
-    Plane,
     Problem,
-    RobinBC,
-    box,
     solve,
     symmetries,
 )
 from dpl.models import Unrolled, linear_response
 from dpl.models.linear_response import LinearResponse
-
-BEAM = box((4, 1, 1), (7, 4, 4))
-LEFT = Plane(0, 0.0)
-SUPPORTS = {
-    "held": [DirichletBC(LEFT)],
-    "moved": [DirichletBC(LEFT), DirichletBC(Plane(0, 4.0), value=[0.05, None, None])],
-    "on a foundation": [DirichletBC(LEFT), RobinBC(Plane(2, 0.0), 0.1)],
-}
 
 
 @pytest.fixture(params=SUPPORTS, scope="module")
@@ -51,26 +40,6 @@ def nodal_forces(scene, count=6):
         vector = torch.randn(force.shape[2], generator=random, dtype=torch.float64)
         force[k, node] = 10.0 ** -(3 * k) * vector
     return torch.where(scene.problem.free, force, 0.0)
-
-
-def exact(scene, force, parameters):
-    """Return displacements K(0)^-1 (f - s) plus the prescribed ones, (B, N, D)."""
-    fields = []
-    for one, own in zip(force, parameters, strict=True):
-        body = scene.problem.with_parameters(own[None])
-        rest = torch.zeros_like(one)[None]
-        moved = body.tangent_product(rest, body.prescribed[None])[0]
-        solver = scene.linear.with_parameters(own[None])
-        fields.append(solver.solve(torch.where(body.free, one - moved, 0.0)) + body.prescribed)
-    return torch.stack(fields)
-
-
-def relative(found, expected):
-    return float(((found - expected).norm(dim=1) / expected.norm(dim=1)).max())
-
-
-def at_free(scene, fields):
-    return fields[:, scene.problem.free]
 
 
 @pytest.mark.parametrize("group", [True, False], ids=["by parity", "whole"])
