@@ -10,10 +10,13 @@ from dpl.fem import Load
 from dpl.fem.rom.stiffness_iteration import check_terms
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.models.linear_response import LinearResponse
+from dpl.models.whitening import FieldWhitening
 from dpl.scene import Scene
 
 Base = Literal["none", "linear"]
 BASES = ("none", "linear")
+SCALE_STREAM = 3  # random stream of the loads for scales; samples use smaller numbers
+SCALE_LOADS = 256
 
 
 def check_base(base: str) -> None:
@@ -38,27 +41,39 @@ class ScaledLinearSolution(NamedTuple):
 class LinearBase:
     """The displacement as the linear solution plus the gated output of a network.
 
-    With the linear solution v of a load, the displacement scale s and the amplitude
-    a = rms(v) / s, the network N predicts
+    With the linear solution v of a load, the displacement scale s, the amplitude a = rms(v) / s and
+    a whitening W of linear solutions, the network N predicts
 
-        u = v + s a^2 / (1 + a) N(v / rms(v), a).
+        u = v + s a^2 / (1 + a) N(W v / rms(v), a).
 
     The nonlinear part of a hyperelastic displacement is O(|f|^2) at small loads and grows at most
     as fast as v at large ones; the gate a^2 / (1 + a) does both. The outputs that are wanted are
     therefore of order one for all loads, and the prediction of a small load is the linear
     solution. v determines the load, so that it replaces the force as the input of the network.
+    W is `FieldWhitening`.
 
     Moved supports are part of the linear solution and keep their prescribed displacements.
+
+    Attributes:
+        whiten: W, a function of fields (B, N, D).
     """
 
-    def __init__(self, scene: Scene) -> None:
-        """Take the scene.
+    def __init__(self, scene: Scene, linear: Tensor | None = None) -> None:
+        """Compute the whitening.
+
+        Args:
+            scene: The scene.
+            linear: Linear solutions of random loads, (S, N, D); None for `sampled_solutions`.
 
         Raises:
             ValueError: K(0) changes too much with the parameters, see `check_terms`.
         """
         self._scene, self._problem = scene, scene.problem
         check_terms(StiffnessTerms.of(scene.problem))
+        if linear is None:
+            linear = sampled_solutions(scene)[1]
+        fields = self.scale_inputs(linear, linear.new_ones(())).field
+        self.whiten = FieldWhitening(fields, scene.problem.free)
 
     @cached_property
     def _response(self) -> LinearResponse:
@@ -76,7 +91,7 @@ class LinearBase:
         return prescribed.index_copy(1, dofs, values).view_as(force)
 
     def scale_inputs(self, linear: Tensor, scale: Tensor) -> ScaledLinearSolution:
-        """Return the inputs of a network.
+        """Return the inputs of a network, with the field before it is whitened.
 
         Args:
             linear: Linear solutions, (B, N, D) [-].
@@ -93,3 +108,12 @@ class LinearBase:
     def gate(self, amplitude: Tensor) -> Tensor:
         """Return a^2 / (1 + a), (B,), of amplitudes a (B,)."""
         return amplitude * (amplitude / (1 + amplitude))
+
+
+def sampled_solutions(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Return the forces and linear solutions of random loads, (S, N, D) each [-], float64.
+
+    The loads are the first of a random stream of their own. Parameters have their values at rest.
+    """
+    force = scene.loads.sample((0, SCALE_STREAM), range(SCALE_LOADS)).force
+    return force, torch.stack([scene.linear.reference.solve(one) for one in force])

@@ -19,12 +19,11 @@ from dpl.models.invariant_basis import (
 from dpl.models.reduced_samples import (
     ReducedDataset,
     ReducedSamples,
-    partial_whitening,
-    root_mean_square,
     squared_projection_error,
 )
 from dpl.models.scalar_inputs import normalise_parameters
 from dpl.models.symmetric_fields import Orbits, coordinates_of_images, sum_over_images
+from dpl.models.whitening import partial_whitening, root_mean_square
 from dpl.scene import Sample, Scene
 from dpl.system.memory import refuse_weights
 

@@ -63,18 +63,3 @@ def squared_projection_error(field: Tensor, coordinates: Tensor) -> Tensor:
         coordinates: Their coordinates in the basis, (B, R).
     """
     return field.flatten(1).square().sum(dim=1) - coordinates.square().sum(dim=1)
-
-
-def partial_whitening(size: Tensor) -> Tensor:
-    """Return divisors (n,) of coordinates with root mean squares `size` (n,).
-
-    The divisor of a coordinate is size^0.6 times the largest size^0.4, so that small coordinates
-    are amplified less than by whitening, and rounding errors at most by 1000.
-    """
-    largest = size.max().clamp(min=1e-30)
-    return (size**0.6 * largest**0.4).clamp(min=1e-3 * float(largest))
-
-
-def root_mean_square(columns: Tensor) -> Tensor:
-    """Return the root mean square of each column of (S, n), (n,)."""
-    return columns.square().mean(dim=0).sqrt()

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from dpl.fem import Load
 from dpl.fem.symmetry import Symmetry
-from dpl.models.linear_base import LinearBase, check_base
+from dpl.models.linear_base import LinearBase, check_base, sampled_solutions
 from dpl.models.protocols import ClosedFormFit, HasBase, TrainsInCoordinates
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
@@ -23,8 +23,6 @@ from dpl.training.losses.loss import Loss, LossContext
 from dpl.training.losses.supervised import SquaredErrorLoss
 from dpl.training.metrics import default_metrics
 from dpl.training.schedules import step_in_time, time_fraction, total_steps
-
-SCALE_STREAM = 3  # random stream of the loads for the scales; samples use smaller numbers
 
 
 class Surrogate(L.LightningModule):
@@ -71,7 +69,6 @@ class Surrogate(L.LightningModule):
         super().__init__()
         self.net, self.loss, self.scene = net, loss, scene
         self._is_closed_form = isinstance(net, ClosedFormFit)
-        self.base = _base_of(net, scene)
         self.batch_errors: Tensor | None = None
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
@@ -85,7 +82,12 @@ class Surrogate(L.LightningModule):
                 )
         largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
         names = ("force_scale", "displacement_scale", "largest_force")
-        factors = torch.ones(2).double().unbind() if self._is_closed_form else scales(scene)
+        self.base, factors = None, torch.ones(2).double().unbind()
+        has_base = _has_base(net)
+        if not self._is_closed_form:
+            force, linear = sampled_solutions(scene)
+            self.base = LinearBase(scene, linear) if has_base else None
+            factors = scales(scene, force, linear)
         for name, value in zip(names, (*factors, largest_force), strict=True):
             self.register_buffer(name, value.clone())
         self.physics = LossContext(scene.problem, self.largest_force)
@@ -120,7 +122,7 @@ class Surrogate(L.LightningModule):
         """Return displacements over L, (B, N, D) [-], of a network with a linear base."""
         field, amplitude = base.scale_inputs(linear, self.displacement_scale)
         more = self._extra_inputs(load, amplitude=amplitude)
-        output = self.unscale_outputs(self.net(field.to(self.dtype), **more))
+        output = self.unscale_outputs(self.net(base.whiten(field.to(self.dtype)), **more))
         return linear + base.gate(amplitude)[:, None, None] * output
 
     def scale_inputs(self, load: Load) -> tuple[Tensor, dict[str, Tensor]]:
@@ -348,28 +350,31 @@ class Surrogate(L.LightningModule):
             set_random_states(self._random_states)
 
 
-def _base_of(net: nn.Module, scene: Scene) -> LinearBase | None:
-    """Return the base of a network, None without.
+def _has_base(net: nn.Module) -> bool:
+    """Return whether a network has a base.
 
     Raises:
         ValueError: There is no such base, or the network is not trained on fields.
     """
     if not isinstance(net, HasBase) or net.base == "none":
-        return None
+        return False
     check_base(net.base)
     if isinstance(net, ClosedFormFit | TrainsInCoordinates):
         raise ValueError(f"{type(net).__name__} requires base = none, not {net.base}")
-    return LinearBase(scene)
+    return True
 
 
-def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
+def scales(scene: Scene, force: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
     """Return the scales of forces and displacements, scalars [-].
 
-    They are root mean squares over the first `count` loads of a separate random stream: of forces
-    over loadable degrees of freedom, of linear solutions over free degrees of freedom.
+    They are root mean squares: of forces over loadable degrees of freedom, of displacements over
+    free degrees of freedom.
+
+    Args:
+        scene: The scene.
+        force: Forces of random loads, (S, N, D) [-].
+        displacement: Their linear solutions, (S, N, D) [-].
     """
-    force = scene.loads.sample((0, SCALE_STREAM), range(count)).force
-    displacement = torch.stack([scene.linear.reference.solve(one) for one in force])
     force = force[:, scene.loads.loadable_dofs]
     displacement = displacement[:, scene.problem.free]
     return force.square().mean().sqrt(), displacement.square().mean().sqrt()
