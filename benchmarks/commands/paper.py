@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig, OmegaConf
 
-from benchmarks.commands import CONF
+from benchmarks.commands import CONF, RESULTS
 from dpl import config
 from dpl.commands.cli import command
 
@@ -51,6 +51,10 @@ def main(cfg: DictConfig) -> None:
             list(cfg.options),
         )
     states = _plan(runs, root, available_cores())
+    if full:
+        _print_estimate(
+            [run for run, one in zip(runs, states, strict=True) if one != paper_runs.State.FINISHED]
+        )
     if cfg.only_plan:
         return
     failed = _train(runs, states, root)
@@ -85,6 +89,19 @@ def _plan(runs: "Sequence[Run]", root: Path, cores: int) -> "list[State]":
             f"runs: {path} was trained with other options; remove it or choose another folder"
         )
     return states
+
+
+def _print_estimate(missing: "Sequence[Run]") -> None:
+    """Print the expected time of runs, from the published tables."""
+    from benchmarks.run_estimates import data_minutes, estimates
+
+    if not missing:
+        return
+    known, data = estimates(missing, RESULTS), data_minutes(missing, RESULTS)
+    line = f"published tables: {sum(known.values()) / 60:.1f} h of training for these, "
+    line += f"{data / 60:.1f} h of data sets"
+    unknown = len(missing) - len(known)
+    print(line + (f"; no time of {unknown} runs" if unknown else ""), flush=True)
 
 
 def _train(runs: "Sequence[Run]", states: "Sequence[State]", root: Path) -> list[str]:

@@ -12,7 +12,14 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from benchmarks import all_results, loss_table, paper_runs, paper_tables, subcommands
+from benchmarks import (
+    all_results,
+    loss_table,
+    paper_runs,
+    paper_tables,
+    run_estimates,
+    subcommands,
+)
 from benchmarks.paper_runs import Run, RunTime, Session, State
 from dpl.commands import dry_run
 from dpl.config import CONF
@@ -40,6 +47,28 @@ def planned(groups=None, more=()):
 
 
 # ------------------------------------------------------------------ the plan
+
+
+def test_expected_times_are_those_of_the_published_tables(tmp_path):
+    head = "method,loads,generation_minutes,training_minutes"
+    rows = [
+        "fcnn,in range,6,10",
+        "fcnn,twice,6,10",
+        "linear,in range,,",
+        "POD-Galerkin,in range,6,1",
+    ]
+    (tmp_path / "beam_svk.csv").write_text("\n".join([head, *rows]))
+    (tmp_path / "propeller_nh.csv").write_text("\n".join([head, "fcnn,in range,7,20"]))
+    (tmp_path / "losses.csv").write_text("runs,seeds,training_minutes\nfcnn-mse,2,3")
+    runs = [*planned().values(), Run("one", "beam_nh_loss/fcnn", ())]
+    assert run_estimates.estimates(runs, tmp_path) == {
+        "beam_svk/fcnn": 10,
+        "propeller_nh/fcnn": 20,
+        "beam_nh_loss/fcnn": 15,  # the mean of those of the other experiments
+        "losses/fcnn-mse-0": 3,
+        "losses/fcnn-mse-1": 3,
+    }
+    assert run_estimates.data_minutes(runs, tmp_path) == 6 + 7
 
 
 def test_each_run_is_planned_for_each_experiment_and_value():
