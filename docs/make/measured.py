@@ -91,24 +91,16 @@ PARTS = (
         "transfer",
         "All load families on the beam",
         "python scripts/transfer.py networks=[unrolled] count=50 families=[cable,gravity,modal,"
-        "modal_small,patch,point,pressure,traction,mixture]",
+        "modal_small,patch,point,pressure,traction,file,mixture]",
         "The network of each family on the test loads of all families: errors of the prediction, "
         "and Newton from the prediction and from rest.",
-        split="trained_on",
-    ),
-    Part(
-        "transfer_file",
-        "Forces of a file on the beam",
-        "python scripts/transfer.py families=[file,modal,mixture] networks=[unrolled] "
-        "name=transfer_file count=50",
-        "The same for the forces of fingertips in `benchmarks/loads/fingertips.npz`.",
         split="trained_on",
     ),
     Part(
         "transfer_bracket",
         "All load families on a bracket from a mesh file",
         "python scripts/transfer.py run=runs/families_bracket name=transfer_bracket count=50",
-        "The same for quadratic tetrahedra and half as many training loads.",
+        "The same for quadratic tetrahedra.",
         split="trained_on",
     ),
     Part(
