@@ -16,12 +16,13 @@ from dpl.models.invariant_basis import (
     pad_columns,
     scatter_fields,
 )
+from dpl.models.linear_base import Base
 from dpl.models.reduced_samples import (
     ReducedDataset,
     ReducedSamples,
     squared_projection_error,
 )
-from dpl.models.scalar_inputs import normalise_parameters
+from dpl.models.scalar_inputs import ScalarInputs
 from dpl.models.symmetric_fields import Orbits, coordinates_of_images, sum_over_images
 from dpl.models.whitening import partial_whitening, root_mean_square
 from dpl.scene import Sample, Scene
@@ -52,7 +53,8 @@ class Block(nn.Module):
 class PODNet(nn.Module):
     """Residual network from POD coordinates of loads to POD coordinates of displacements.
 
-    The bases are those of the training loads and displacements. If the body has symmetries, both
+    The bases are those of the training loads and displacements, or with a linear base of linear
+    solutions and of what has to be added to them. If the body has symmetries, both
     bases are invariant under them, and the prediction in evaluation mode is the mean over all
     images of the load, each transformed back. It then has the symmetries exactly.
 
@@ -91,6 +93,7 @@ class PODNet(nn.Module):
         width: int = 256,
         blocks: int = 4,
         symmetry: bool = True,
+        base: Base = "none",
     ) -> None:
         """Build the network; its bases are zero until `fit_bases`.
 
@@ -101,9 +104,10 @@ class PODNet(nn.Module):
             width: Units of the hidden layers.
             blocks: Number of residual blocks, each of two layers.
             symmetry: Find the symmetries of the body and build them into the network.
+            base: "linear" for the nonlinear displacement as output, see `LinearBase`.
 
         Raises:
-            ValueError: A number is out of range.
+            ValueError: A number is out of range, or there is no such base.
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
@@ -112,19 +116,20 @@ class PODNet(nn.Module):
                 raise ValueError(f"{name} = {number} must be 1 or more")
         if not 0 <= blocks <= MAX_BLOCKS:
             raise ValueError(f"blocks = {blocks} must be 0 or more and at most {MAX_BLOCKS}")
-        self.scene = scene
+        self.scene, self.base = scene, base
+        self.scalars = ScalarInputs(scene, base)
+        self.extra_inputs = self.scalars.names
         constant = scene.loads.constant_force
         also = [] if constant is None else [constant]
         self.group = symmetries(scene.problem, also=also) if symmetry else []
-        self.register_buffer("load_dofs", scene.loads.loadable_dofs, persistent=False)
+        read = scene.problem.free if base == "linear" else scene.loads.loadable_dofs
+        self.register_buffer("load_dofs", read, persistent=False)
         self.register_buffer("free_dofs", scene.problem.free, persistent=False)
         self.input_orbits = Orbits(self.group, self.load_dofs)
         self.output_orbits = Orbits(self.group, self.free_dofs)
         rank = min(rank, int(self.free_dofs.sum()))
         coordinates = min(coordinates, int(self.load_dofs.sum()))
-        self.parameter_ranges = scene.loads.parameter_ranges
-        self.extra_inputs = ("parameters",) if self.parameter_ranges else ()
-        inputs = coordinates + len(self.extra_inputs)
+        inputs = coordinates + self.scalars.count
         weights = width * (inputs + 1) + (width + 1) * rank + 2 * blocks * width * (width + 1)
         refuse_weights(weights, None, "take a smaller model.width or model.blocks")
         self._register_bases(rank, coordinates)
@@ -134,7 +139,7 @@ class PODNet(nn.Module):
 
     def _register_bases(self, rank: int, coordinates: int) -> None:
         """Register the buffers of the bases, filled with zeros."""
-        members, inputs = max(1, len(self.group)), coordinates + len(self.extra_inputs)
+        members, inputs = max(1, len(self.group)), coordinates + self.scalars.count
         for name, shape in {
             "modes": (rank, len(self.output_orbits.weights)),
             "load_basis": (len(self.input_orbits.weights), coordinates),
@@ -157,15 +162,18 @@ class PODNet(nn.Module):
         """See `TrainsInCoordinates`."""
         return bool(self.group)
 
-    def forward(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
+    def forward(
+        self, force: Tensor, parameters: Tensor | None = None, amplitude: Tensor | None = None
+    ) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
-            force: Scaled nodal forces.
+            force: Scaled nodal forces, or scaled linear solutions with a linear base.
             parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
+            amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
         """
         encoded = self.encode_loads(self.input_orbits.images(force))
-        inputs = self.append_parameters(encoded @ self.input_map, parameters)
+        inputs = self.append_scalars(encoded @ self.input_map, parameters, amplitude)
         return self.field(self.symmetrised_output(inputs), force)
 
     def encode_loads(self, images: Tensor) -> Tensor:
@@ -173,12 +181,13 @@ class PODNet(nn.Module):
         read = images @ self.load_basis.to(images)
         return sum_over_images(read, self.inverse_load_actions.to(images))
 
-    def append_parameters(self, inputs: Tensor, parameters: Tensor | None) -> Tensor:
-        """Return inputs (B, M), with normalised parameters if the law has ranges."""
-        if not self.parameter_ranges:
+    def append_scalars(
+        self, inputs: Tensor, parameters: Tensor | None, amplitude: Tensor | None
+    ) -> Tensor:
+        """Return inputs (B, M) with the numbers of `ScalarInputs`, if there are any."""
+        if not self.scalars.count:
             return inputs
-        values = normalise_parameters(parameters, self.parameter_ranges, inputs)
-        return torch.cat([inputs, values], dim=1)
+        return torch.cat([inputs, self.scalars(inputs, amplitude, parameters)], dim=1)
 
     def field(self, coordinates: Tensor, like: Tensor) -> Tensor:
         """Return displacements (B, N, D), shaped like `like`, of coordinates (B, R)."""
@@ -298,26 +307,30 @@ class PODNet(nn.Module):
 
     # ------------------------------------------------------------------ reduced samples
 
-    def encode(self, samples: Sample) -> ReducedDataset:
+    def encode(self, samples: Sample, amplitude: Tensor | None = None) -> ReducedDataset:
         """See `TrainsInCoordinates`."""
         displacement = torch.where(self.free_dofs.cpu(), samples.displacement, 0.0)
         samples = samples._replace(displacement=displacement)
+        columns = [*samples, torch.ones_like(samples.young) if amplitude is None else amplitude]
         device = self.output_scale.device
-        chunks = zip(*(column.split(CHUNK) for column in samples), strict=True)
-        encoded = [self._encode_chunk(Sample(*(c.to(device) for c in chunk))) for chunk in chunks]
+        chunks = zip(*(column.split(CHUNK) for column in columns), strict=True)
+        encoded = [self._encode_chunk(*(column.to(device) for column in one)) for one in chunks]
         whole = ReducedSamples(*map(torch.cat, zip(*encoded, strict=True)))
         return ReducedDataset(whole, self.input_actions.cpu(), self.inverse_output_actions.mT.cpu())
 
-    def _encode_chunk(self, samples: Sample) -> ReducedSamples:
+    def _encode_chunk(self, *columns: Tensor) -> ReducedSamples:
+        """Return the reduced samples of the columns of samples and their amplitudes."""
+        samples, amplitude = Sample(*columns[:-1]), columns[-1]
         targets = self.coordinates(samples.displacement)
         error = squared_projection_error(samples.displacement, targets)
         read = self.encode_loads(self.input_orbits.images(samples.force))
-        inputs = self.append_parameters(read @ self.input_map.to(read), samples.parameters)
+        inputs = self.append_scalars(read @ self.input_map.to(read), samples.parameters, amplitude)
         square = samples.displacement.flatten(1).square().sum(1)
         encoded = ReducedSamples(
             inputs=inputs.float(),
             targets=targets.float(),
             squared_error=error.clamp(min=0),
             mean_square=square / self.free_dofs.numel(),
+            factor=torch.ones_like(square),
         )
         return ReducedSamples(*(column.cpu() for column in encoded))

@@ -18,7 +18,9 @@ class TrainsInCoordinates(Protocol):
     """A network between reduced coordinates of loads and displacements.
 
     `dpl.training.Surrogate` lets it fit its bases before training. If the loss is a function of
-    squared errors, it trains the network on samples in reduced coordinates.
+    squared errors, it trains the network on samples in reduced coordinates. With a base
+    (`HasBase`) the forces of the samples are scaled linear solutions and their displacements what
+    the network has to predict.
     """
 
     @property
@@ -35,8 +37,13 @@ class TrainsInCoordinates(Protocol):
         """Compute the bases from scaled training samples (S, N, D), float64."""
         ...
 
-    def encode(self, samples: Sample) -> ReducedDataset:
-        """Return scaled samples (S, N, D), float64, in reduced coordinates."""
+    def encode(self, samples: Sample, amplitude: Tensor | None = None) -> ReducedDataset:
+        """Return scaled samples (S, N, D), float64, in reduced coordinates.
+
+        Args:
+            samples: The samples.
+            amplitude: Amplitudes of the linear solutions, (S,); required with a linear base.
+        """
         ...
 
     def network(self, inputs: Tensor) -> Tensor:

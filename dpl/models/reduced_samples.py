@@ -15,12 +15,14 @@ class ReducedSamples(NamedTuple):
         targets: Coordinates of the displacements in an orthonormal basis, (B, R) [-].
         squared_error: Squared projection errors of the displacements, (B,) [-].
         mean_square: Mean squares of the displacements over degrees of freedom, (B,) [-].
+        factor: Factors of the predictions in the displacements, (B,) [-]; see `LinearBase.gate`.
     """
 
     inputs: Tensor
     targets: Tensor
     squared_error: Tensor
     mean_square: Tensor
+    factor: Tensor
 
 
 class ReducedDataset(Dataset):
@@ -43,6 +45,7 @@ class ReducedDataset(Dataset):
             targets=(samples.targets @ target_actions).flatten(0, 1),
             squared_error=samples.squared_error.repeat(images),
             mean_square=samples.mean_square.repeat(images),
+            factor=samples.factor.repeat(images),
         )
 
     def __len__(self) -> int:

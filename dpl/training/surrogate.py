@@ -122,7 +122,10 @@ class Surrogate(L.LightningModule):
         """Return displacements over L, (B, N, D) [-], of a network with a linear base."""
         field, amplitude = base.scale_inputs(linear, self.displacement_scale)
         more = self._extra_inputs(load, amplitude=amplitude)
-        output = self.unscale_outputs(self.net(base.whiten(field.to(self.dtype)), **more))
+        field = field.to(self.dtype)
+        if not isinstance(self.net, TrainsInCoordinates):  # which whitens coordinates
+            field = base.whiten(field)
+        output = self.unscale_outputs(self.net(field, **more))
         return linear + base.gate(amplitude)[:, None, None] * output
 
     def scale_inputs(self, load: Load) -> tuple[Tensor, dict[str, Tensor]]:
@@ -208,7 +211,8 @@ class Surrogate(L.LightningModule):
         net = cast(TrainsInCoordinates, self.net)
         error = (net.network(batch.inputs) - batch.targets).square().sum(dim=1)
         square = self.displacement_scale**2
-        error = square * (error + batch.squared_error) / self.scene.problem.free.numel()
+        error = square * batch.factor.square() * (error + batch.squared_error)
+        error = error / self.scene.problem.free.numel()
         loss = cast(SquaredErrorLoss, self.loss)
         return loss.from_squared_errors(error, square * batch.mean_square)
 
@@ -228,22 +232,40 @@ class Surrogate(L.LightningModule):
             samples: The samples.
             group: Symmetries of the body whose images of samples are wanted; empty for none.
         """
-        if self.base is not None:
-            return LinearSamples(samples, self.base, group)
-        if not self._trains_in_coordinates:
-            return None
         net = cast(TrainsInCoordinates, self.net)
-        return None if len(group) > 1 and not net.is_symmetric else net.encode(self._scale(samples))
+        if self._trains_in_coordinates and (len(group) < 2 or net.is_symmetric):
+            return self._encode_in_coordinates(net, samples)
+        return None if self.base is None else LinearSamples(samples, self.base, group)
 
-    def _scale(self, samples: Sample) -> Sample:
-        return samples._replace(
-            force=samples.force / self.force_scale.cpu(),
-            displacement=samples.displacement / self.displacement_scale.cpu(),
+    def _encode_in_coordinates(self, net: TrainsInCoordinates, samples: Sample) -> ReducedDataset:
+        scaled, amplitude = self._scale(samples)
+        if self.base is None:
+            return net.encode(scaled)
+        data = net.encode(scaled, amplitude)
+        whole = samples.displacement / self.displacement_scale.cpu()
+        images = len(data) // len(whole)
+        data.samples = data.samples._replace(
+            mean_square=whole.square().flatten(1).mean(dim=1).repeat(images),
+            factor=self.base.gate(amplitude).repeat(images),
         )
+        return data
+
+    def _scale(self, samples: Sample) -> tuple[Sample, Tensor]:
+        """Return samples (S, N, D) as a network of coordinates sees them, and amplitudes (S,)."""
+        size = self.displacement_scale.cpu()
+        if self.base is None:
+            force = samples.force / self.force_scale.cpu()
+            scaled = samples._replace(force=force, displacement=samples.displacement / size)
+            return scaled, torch.ones_like(samples.young)
+        linear = LinearSamples(samples, self.base).linear.double()
+        field, amplitude = self.base.scale_inputs(linear, size)
+        factor = (size * self.base.gate(amplitude))[:, None, None]
+        wanted = (samples.displacement - linear) / torch.where(factor > 0, factor, 1.0)
+        return samples._replace(force=field, displacement=wanted), amplitude
 
     def fit_bases(self, samples: Sample) -> None:
         """Fit the bases of the network to training samples (S, N, D)."""
-        cast(TrainsInCoordinates, self.net).fit_bases(self._scale(samples))
+        cast(TrainsInCoordinates, self.net).fit_bases(self._scale(samples)[0])
 
     def validation_step(self, batch: Sample, batch_idx: int) -> None:
         """Update the validation metrics."""
@@ -354,12 +376,12 @@ def _has_base(net: nn.Module) -> bool:
     """Return whether a network has a base.
 
     Raises:
-        ValueError: There is no such base, or the network is not trained on fields.
+        ValueError: There is no such base, or the network is not trained by gradient descent.
     """
     if not isinstance(net, HasBase) or net.base == "none":
         return False
     check_base(net.base)
-    if isinstance(net, ClosedFormFit | TrainsInCoordinates):
+    if isinstance(net, ClosedFormFit):
         raise ValueError(f"{type(net).__name__} requires base = none, not {net.base}")
     return True
 
