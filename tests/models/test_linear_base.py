@@ -18,11 +18,14 @@ from dpl.fem import (
     solve,
     symmetries,
 )
-from dpl.models import CNN, FCNN, GNN, LinearBase, PODNet
+from dpl.fem.symmetry import images
+from dpl.models import CNN, FCNN, GNN, LinearBase, PODNet, Unrolled
+from dpl.models.reduced_samples import ReducedDataset
 from dpl.training import MSE, RMSELoss, Surrogate
 from dpl.training.linear_samples import LinearBatch, LinearSamples
 
 NETS = {"fcnn": (FCNN, {"width": 16}), "cnn": (CNN, {"channels": 2}), "gnn": (GNN, {"width": 4})}
+POD = {"rank": 30, "coordinates": 20, "width": 16, "blocks": 1}
 
 
 class OwnNet(torch.nn.Module):
@@ -186,6 +189,33 @@ def test_training_reduces_the_error_of_small_and_large_loads(name, scene, batch)
     assert (after < 0.9 * before).all()
 
 
+@pytest.mark.parametrize("loss", [MSE(), RMSELoss(relative=1.0, floor=0.0)], ids=["mse", "rmse"])
+def test_training_in_coordinates_has_the_loss_of_training_on_fields(scene, batch, loss):
+    torch.manual_seed(0)
+    surrogate = Surrogate(PODNet(scene, base="linear", **POD), loss, scene).train()
+    surrogate.log = lambda *_, **__: None
+    surrogate.fit_bases(batch)
+    reduced = surrogate.encode(batch, symmetries(scene.problem))
+    assert isinstance(reduced, ReducedDataset)
+    own = reduced.__getitems__(list(range(len(batch.force))))
+    in_coordinates = surrogate.training_step(own, 0)
+    assert torch.isclose(in_coordinates, surrogate.training_step(batch, 0), rtol=1e-4)
+
+
+def test_pod_on_the_linear_solution_has_the_symmetries_of_the_body(scene, batch):
+    torch.manual_seed(0)
+    surrogate = Surrogate(PODNet(scene, base="linear", **POD), MSE(), scene).eval()
+    surrogate.fit_bases(batch)
+    group = symmetries(scene.problem)
+    assert len(group) > 1
+    which = torch.arange(len(group)).remainder(len(group))[: len(batch.force)]
+    force = batch.force[: len(which)]
+    with torch.no_grad():
+        turned = surrogate.predict(Load(images(force, group, which), batch.young[: len(which)]))
+        expected = images(surrogate.predict(Load(force, batch.young[: len(which)])), group, which)
+    assert relative(turned, expected).max() < 1e-4
+
+
 @pytest.mark.parametrize("base", ["none", "linear"])
 @pytest.mark.parametrize("name", NETS)
 def test_half_precision_products_change_a_prediction_by_their_rounding(name, base, scene, batch):
@@ -219,9 +249,9 @@ def test_an_unknown_base_is_refused(scene, kind):
 def test_what_excludes_a_base_is_refused(scene):
     with pytest.raises(ValueError, match="young = true requires base = none"):
         FCNN(scene, young=True, base="linear")
-    net = PODNet(scene, rank=4, coordinates=4, width=8, blocks=1)
+    net = Unrolled(scene)
     net.base = "linear"
-    with pytest.raises(ValueError, match="PODNet requires base = none"):
+    with pytest.raises(ValueError, match="Unrolled requires base = none"):
         Surrogate(net, MSE(), scene)
     with pytest.raises(ValueError, match="amplitude is an input"):
         CNN(scene, channels=2, base="linear")(torch.zeros(1, *scene.problem.shape))

@@ -8,9 +8,9 @@ import torch
 from dpl import Sample
 from dpl.fem.symmetry import images
 from dpl.models import FCNN, PODNet
+from dpl.models.linear_base import sampled_solutions
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.training import MSE, LrStar, RMSELoss, Surrogate
-from dpl.training.surrogate import scales
 
 SMALL = {"width": 16, "blocks": 1}
 CASES = pytest.mark.parametrize(
@@ -20,9 +20,10 @@ CASES = pytest.mark.parametrize(
 
 @pytest.fixture(scope="module", autouse=True)
 def scales_of_a_scene_once():
-    """Caches the scales of a scene, whose computation dominates the run time of these tests."""
+    """Caches the solutions for the scales, which dominate the run time of these tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dpl.training.surrogate.scales", functools.cache(scales))
+        cached = functools.cache(sampled_solutions)
+        patch.setattr("dpl.training.surrogate.sampled_solutions", cached)
         yield
 
 
@@ -199,7 +200,7 @@ def test_the_first_images_are_the_inputs_of_the_network(build, batch):
 def test_batches_are_fetched_in_any_order():
     random = torch.Generator().manual_seed(0)
     parts = [torch.randn(3, 2, generator=random), torch.randn(3, 4, generator=random)]
-    numbers = torch.arange(3.0), torch.arange(3.0, 6.0)
+    numbers = torch.arange(3.0), torch.arange(3.0, 6.0), torch.arange(6.0, 9.0)
     turn = torch.stack([torch.eye(2), torch.tensor([[0.0, 1.0], [-1.0, 0.0]])])
     samples = ReducedDataset(
         ReducedSamples(*parts, *numbers), turn, torch.stack([torch.eye(4), -torch.eye(4)])
@@ -211,6 +212,7 @@ def test_batches_are_fetched_in_any_order():
     assert torch.equal(batch.targets, torch.stack([-parts[1][2], parts[1][0], -parts[1][0]]))
     assert batch.squared_error.tolist() == [2.0, 0.0, 0.0]
     assert batch.mean_square.tolist() == [5.0, 3.0, 3.0]
+    assert batch.factor.tolist() == [8.0, 6.0, 6.0]
 
 
 def test_the_data_module_computes_images_if_the_network_has_no_symmetry(build, scene, data, batch):
