@@ -69,6 +69,7 @@ class Surrogate(L.LightningModule):
         super().__init__()
         self.net, self.loss, self.scene = net, loss, scene
         self._is_closed_form = isinstance(net, ClosedFormFit)
+        self._has_coordinates = isinstance(net, TrainsInCoordinates)
         self.batch_errors: Tensor | None = None
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
@@ -123,7 +124,7 @@ class Surrogate(L.LightningModule):
         field, amplitude = base.scale_inputs(linear, self.displacement_scale)
         more = self._extra_inputs(load, amplitude=amplitude)
         field = field.to(self.dtype)
-        if not isinstance(self.net, TrainsInCoordinates):  # which whitens coordinates
+        if not self._has_coordinates:  # a network with coordinates whitens these
             field = base.whiten(field)
         output = self.unscale_outputs(self.net(field, **more))
         return linear + base.gate(amplitude)[:, None, None] * output
@@ -186,7 +187,7 @@ class Surrogate(L.LightningModule):
 
     @property
     def _trains_in_coordinates(self) -> bool:
-        return isinstance(self.net, TrainsInCoordinates) and isinstance(self.loss, SquaredErrorLoss)
+        return self._has_coordinates and isinstance(self.loss, SquaredErrorLoss)
 
     def training_step(
         self, batch: Sample | LinearBatch | ReducedSamples, batch_idx: int
@@ -283,7 +284,8 @@ class Surrogate(L.LightningModule):
     def setup(self, stage: str) -> None:
         """Fit the bases of the network."""
         # before later hooks: schedules load the batches, and encoding them takes the bases
-        if stage == "fit" and isinstance(self.net, TrainsInCoordinates) and not self.net.is_fitted:
+        net = cast(TrainsInCoordinates, self.net)
+        if stage == "fit" and self._has_coordinates and not net.is_fitted:
             self.fit_bases(self.trainer.datamodule.snapshots())
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:

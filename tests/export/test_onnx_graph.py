@@ -90,6 +90,11 @@ NETWORKS = {
     "gnn, poisson": (GNN, {"width": 8}, {"poisson": [0.2, 0.4]}),
     "pod": (PODNet, {"rank": 8, "width": 16}, {}),
     "fcnn, linear base": (FCNN, {"width": 16, "base": "linear"}, {}),
+    "pod, linear base": (
+        PODNet,
+        {"rank": 8, "width": 16, "base": "linear"},
+        {"poisson": [0.2, 0.4]},
+    ),
     "unrolled": (Unrolled, {"rank": 12, "cells": 8, "stages": 1}, {}),
     "unrolled, quadratic": (
         Unrolled,
