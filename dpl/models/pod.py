@@ -54,9 +54,9 @@ class PODNet(nn.Module):
     """Residual network from POD coordinates of loads to POD coordinates of displacements.
 
     The bases are those of the training loads and displacements, or with a linear base of linear
-    solutions and of what has to be added to them. If the body has symmetries, both
-    bases are invariant under them, and the prediction in evaluation mode is the mean over all
-    images of the load, each transformed back. It then has the symmetries exactly.
+    solutions and of what has to be added to them. If the body has symmetries, both bases are
+    invariant under them, and the prediction in evaluation mode is the mean over all images of the
+    load, each transformed back. It then has the symmetries exactly.
 
     Source: Hesthaven, Ubbiali (2018), Non-intrusive reduced order modeling of nonlinear problems
     using neural networks, J. Comput. Phys. 363.
