@@ -1,5 +1,7 @@
 """Whitening: inputs of networks whose rare parts are not drowned by the frequent ones."""
 
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 from torch import Tensor
 
@@ -62,7 +64,14 @@ class FieldWhitening:
             parts = self._modes.to(field.device), self._factors.to(field.device)
             self._on_device[field.device] = parts
         modes, factors = (part.to(field.dtype) for part in self._on_device[field.device])
-        with torch.autocast(field.device.type, enabled=False):  # amplifies rounding errors
+        with _full_precision(field.device):  # rounding errors would be amplified
             coordinates = field.flatten(1) @ modes.T
             amplified = (coordinates * (factors - factors[-1])) @ modes
         return factors[-1] * field + amplified.view_as(field)
+
+
+def _full_precision(device: torch.device) -> AbstractContextManager[object]:
+    """Return a context without `torch.autocast`, on devices that know it."""
+    if not torch.amp.is_autocast_available(device.type):
+        return nullcontext()
+    return torch.autocast(device.type, enabled=False)

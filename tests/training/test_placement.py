@@ -26,6 +26,7 @@ NETWORKS = {
     "gnn": partial(GNN, width=8),
     "gnn linear": partial(GNN, width=8, base="linear"),
     "pod": partial(PODNet, width=16, blocks=1),
+    "pod linear": partial(PODNet, width=16, blocks=1, base="linear"),
 }
 LOSSES = [MSE, LrStar, LrPlus, EnergyNormLoss, PotentialEnergyLoss]
 NO_GPU = "needs a CUDA device: torch.cuda.is_available() is false"
