@@ -1,17 +1,19 @@
 """Expected times of the runs of the paper's tables, from the times in published tables."""
 
-import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean
 
+from benchmarks.loss_table import LossRow
 from benchmarks.paper_runs import Run
+from benchmarks.paper_tables import Result
+from dpl.evaluation.tables import read
 
-LOSSES = "losses"  # table of the runs of that folder; its rows are means over seeds
+LOSSES = "losses"  # folder of runs, and stem of their table, whose rows are medians over seeds
 
 
-def estimates(runs: Sequence[Run], results: Path) -> dict[str, float]:
-    """Return the expected minutes of training of runs by path; unknown ones are left out.
+def expected_minutes(runs: Sequence[Run], results: Path) -> dict[str, float]:
+    """Return the minutes of training of runs by path; unknown ones are left out.
 
     They are those of the row of the same name in the table of its experiment. A run without such a
     row takes the mean over other experiments, if one of them has the name.
@@ -20,26 +22,30 @@ def estimates(runs: Sequence[Run], results: Path) -> dict[str, float]:
         runs: The runs.
         results: Folder with tables `EXPERIMENT.csv`.
     """
-    folders = {folder_of(run) for run in runs}
-    known = {
-        f"{folder}/{name}": minutes
-        for folder in folders
-        for name, minutes in _training_minutes(results / f"{folder}.csv")
-    }
+    known: dict[str, float] = {}
+    for folder in sorted({folder_of(run) for run in runs}):
+        for row in _rows(folder, results):
+            name = row.runs if isinstance(row, LossRow) else row.method
+            if row.training_minutes is not None:
+                known[f"{folder}/{name}"] = row.training_minutes
     found = {}
     for run in runs:
         path = run.path.rpartition("-")[0] if folder_of(run) == LOSSES else run.path
         name = path.rpartition("/")[2]
         others = [minutes for key, minutes in known.items() if key.rpartition("/")[2] == name]
-        if path in known or others:
-            found[run.path] = known.get(path) or mean(others)
+        if others:
+            found[run.path] = known.get(path, mean(others))
     return found
 
 
 def data_minutes(runs: Sequence[Run], results: Path) -> float:
-    """Return the minutes that the data sets of runs took, each counted once."""
-    folders = {folder_of(run) for run in runs}
-    return sum(max(_generation_minutes(results / f"{name}.csv"), default=0) for name in folders)
+    """Return the minutes in which the data sets of runs were solved, each counted once."""
+    tables = [_rows(folder, results) for folder in {folder_of(run) for run in runs}]
+    minutes = [
+        [row.generation_minutes or 0.0 for row in rows if isinstance(row, Result)]
+        for rows in tables
+    ]
+    return sum(max(table, default=0.0) for table in minutes)
 
 
 def folder_of(run: Run) -> str:
@@ -47,20 +53,9 @@ def folder_of(run: Run) -> str:
     return run.path.partition("/")[0]
 
 
-def _training_minutes(path: Path) -> Iterator[tuple[str, float]]:
-    for row in _rows(path):
-        if minutes := row.get("training_minutes"):
-            yield row.get("method") or row["runs"], float(minutes)
-
-
-def _generation_minutes(path: Path) -> Iterator[float]:
-    return (
-        float(row["generation_minutes"]) for row in _rows(path) if row.get("generation_minutes")
-    )
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
+def _rows(folder: str, results: Path) -> Sequence[Result | LossRow]:
+    """Return the rows of the table of a folder of runs; none without a table."""
+    path = results / f"{folder}.csv"
     if not path.is_file():
         return []
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+    return read(LossRow, path) if folder == LOSSES else read(Result, path)

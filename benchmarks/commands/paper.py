@@ -52,9 +52,8 @@ def main(cfg: DictConfig) -> None:
         )
     states = _plan(runs, root, available_cores())
     if full:
-        _print_estimate(
-            [run for run, one in zip(runs, states, strict=True) if one != paper_runs.State.FINISHED]
-        )
+        pairs = zip(runs, states, strict=True)
+        _print_estimate([run for run, state in pairs if state != paper_runs.State.FINISHED])
     if cfg.only_plan:
         return
     failed = _train(runs, states, root)
@@ -93,11 +92,11 @@ def _plan(runs: "Sequence[Run]", root: Path, cores: int) -> "list[State]":
 
 def _print_estimate(missing: "Sequence[Run]") -> None:
     """Print the expected time of runs, from the published tables."""
-    from benchmarks.run_estimates import data_minutes, estimates
+    from benchmarks.run_estimates import data_minutes, expected_minutes
 
     if not missing:
         return
-    known, data = estimates(missing, RESULTS), data_minutes(missing, RESULTS)
+    known, data = expected_minutes(missing, RESULTS), data_minutes(missing, RESULTS)
     line = f"published tables: {sum(known.values()) / 60:.1f} h of training for these, "
     line += f"{data / 60:.1f} h of data sets"
     unknown = len(missing) - len(known)

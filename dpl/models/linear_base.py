@@ -105,6 +105,17 @@ class LinearBase:
         field = linear / torch.where(square > 0, size, 1.0)[:, None, None]
         return ScaledLinearSolution(field, size / scale)
 
+    def scale_outputs(self, nonlinear: Tensor, amplitude: Tensor, scale: Tensor) -> Tensor:
+        """Return the outputs of a network, (B, N, D), that give nonlinear displacements.
+
+        Args:
+            nonlinear: Displacements without the linear solutions, (B, N, D) [-].
+            amplitude: Amplitudes of the linear solutions, (B,) [-].
+            scale: Displacement scale, () [-].
+        """
+        factor = (scale * self.gate(amplitude))[:, None, None]
+        return nonlinear / torch.where(factor > 0, factor, 1.0)
+
     def gate(self, amplitude: Tensor) -> Tensor:
         """Return a^2 / (1 + a), (B,), of amplitudes a (B,)."""
         return amplitude * (amplitude / (1 + amplitude))

@@ -55,14 +55,13 @@ class FieldWhitening:
         factors = factors / (square / len(vectors)).sqrt()  # the mean square of a result is one
         modes = vectors.new_zeros(len(factors), free.numel())
         modes[:, free.flatten()] = vectors.T
-        self._modes, self._factors = modes.float(), factors.float()
-        self._on_device = {modes.device: (self._modes, self._factors)}
+        self._on_device = {modes.device: (modes.float(), factors.float())}
 
     def __call__(self, field: Tensor) -> Tensor:
         """Return whitened fields, (B, N, D), of fields (B, N, D) of any precision."""
         if field.device not in self._on_device:
-            parts = self._modes.to(field.device), self._factors.to(field.device)
-            self._on_device[field.device] = parts
+            modes, factors = next(iter(self._on_device.values()))
+            self._on_device[field.device] = modes.to(field.device), factors.to(field.device)
         modes, factors = (part.to(field.dtype) for part in self._on_device[field.device])
         with _full_precision(field.device):  # rounding errors would be amplified
             coordinates = field.flatten(1) @ modes.T

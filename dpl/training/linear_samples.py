@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dpl.data.datamodule import Samples
+from dpl.fem import Load
 from dpl.fem.symmetry import Symmetry, images
 from dpl.models.linear_base import LinearBase
 from dpl.scene import Sample
@@ -38,10 +39,7 @@ class LinearSamples(Samples):
             group: See `Samples`.
         """
         super().__init__(samples, group)
-        load = samples.load
-        parts = zip(*(column.split(CHUNK) for column in load), strict=True)
-        solved = [base.solve(type(load)(*part)).float() for part in parts]
-        self.linear = torch.cat(solved)
+        self.linear = linear_solutions(samples.load, base)
 
     def __getitems__(self, indices: list[int]) -> LinearBatch:  # type: ignore[override]
         """Return a batch."""
@@ -50,3 +48,9 @@ class LinearSamples(Samples):
         if self.group:
             linear = images(linear, self.group, torch.tensor([i // count for i in indices]))
         return LinearBatch(linear.float(), super().__getitems__(indices))
+
+
+def linear_solutions(load: Load, base: LinearBase) -> Tensor:
+    """Return the linear solutions of many loads, (S, N, D) [-], float32, solved in chunks."""
+    parts = zip(*(column.split(CHUNK) for column in load), strict=True)
+    return torch.cat([base.solve(Load(*part)).float() for part in parts])

@@ -1,12 +1,10 @@
 """The LightningModule: a network with scales, loss, metrics and optimiser."""
 
-import random
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Self, cast
 
 import lightning as L
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -18,10 +16,11 @@ from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
 from dpl.training.callbacks.averaged_weights import AveragedWeights
 from dpl.training.callbacks.closed_form import ClosedFormTraining
-from dpl.training.linear_samples import LinearBatch, LinearSamples
+from dpl.training.linear_samples import LinearBatch, LinearSamples, linear_solutions
 from dpl.training.losses.loss import Loss, LossContext
 from dpl.training.losses.supervised import SquaredErrorLoss
 from dpl.training.metrics import default_metrics
+from dpl.training.random_states import random_states, set_random_states
 from dpl.training.schedules import step_in_time, time_fraction, total_steps
 
 
@@ -84,10 +83,10 @@ class Surrogate(L.LightningModule):
         largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
         names = ("force_scale", "displacement_scale", "largest_force")
         self.base, factors = None, torch.ones(2).double().unbind()
-        has_base = _has_base(net)
+        adds_to_base = _adds_to_base(net)
         if not self._is_closed_form:
             force, linear = sampled_solutions(scene)
-            self.base = LinearBase(scene, linear) if has_base else None
+            self.base = LinearBase(scene, linear) if adds_to_base else None
             factors = scales(scene, force, linear)
         for name, value in zip(names, (*factors, largest_force), strict=True):
             self.register_buffer(name, value.clone())
@@ -166,15 +165,11 @@ class Surrogate(L.LightningModule):
 
     def describe(self) -> list[tuple[str, str]]:
         """Return name and size of the network, and the loss."""
+        kind = type(self.net).__name__
         if self._is_closed_form:
-            return [("model", f"{type(self.net).__name__}, fitted by linear regression")]
+            return [("model", f"{kind}, fitted by linear regression")]
         count = sum(weights.numel() for weights in self.net.parameters())
-        return [
-            (
-                "model",
-                f"{type(self.net).__name__}, {count:,} weights; loss {type(self.loss).__name__}",
-            )
-        ]
+        return [("model", f"{kind}, {count:,} weights; loss {type(self.loss).__name__}")]
 
     def skipped_work(self) -> list[str]:
         """Return the work that network and loss save, one line each."""
@@ -258,10 +253,9 @@ class Surrogate(L.LightningModule):
             force = samples.force / self.force_scale.cpu()
             scaled = samples._replace(force=force, displacement=samples.displacement / size)
             return scaled, torch.ones_like(samples.young)
-        linear = LinearSamples(samples, self.base).linear.double()
+        linear = linear_solutions(samples.load, self.base).double()
         field, amplitude = self.base.scale_inputs(linear, size)
-        factor = (size * self.base.gate(amplitude))[:, None, None]
-        wanted = (samples.displacement - linear) / torch.where(factor > 0, factor, 1.0)
+        wanted = self.base.scale_outputs(samples.displacement - linear, amplitude, size)
         return samples._replace(force=field, displacement=wanted), amplitude
 
     def fit_bases(self, samples: Sample) -> None:
@@ -374,8 +368,8 @@ class Surrogate(L.LightningModule):
             set_random_states(self._random_states)
 
 
-def _has_base(net: nn.Module) -> bool:
-    """Return whether a network has a base.
+def _adds_to_base(net: nn.Module) -> bool:
+    """Return True if the output of a network is added to linear solutions.
 
     Raises:
         ValueError: There is no such base, or the network is not trained by gradient descent.
@@ -402,25 +396,3 @@ def scales(scene: Scene, force: Tensor, displacement: Tensor) -> tuple[Tensor, T
     force = force[:, scene.loads.loadable_dofs]
     displacement = displacement[:, scene.problem.free]
     return force.square().mean().sqrt(), displacement.square().mean().sqrt()
-
-
-def random_states() -> dict[str, Any]:
-    """Return the states of all random number generators of this process as tensors and numbers."""
-    kind, keys, *rest = np.random.get_state()  # noqa: NPY002 - which other packages use
-    return {
-        "torch": torch.get_rng_state(),
-        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        "numpy": [kind, torch.from_numpy(np.asarray(keys).astype(np.int64)), *rest],
-        "python": random.getstate(),
-    }
-
-
-def set_random_states(states: dict[str, Any]) -> None:
-    """Restore the states returned by `random_states`."""
-    kind, keys, *rest = states["numpy"]
-    torch.set_rng_state(states["torch"].cpu())
-    if states["cuda"] and torch.cuda.device_count() == len(states["cuda"]):
-        torch.cuda.set_rng_state_all([state.cpu() for state in states["cuda"]])
-    np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))  # noqa: NPY002
-    version, numbers, gauss = states["python"]
-    random.setstate((version, tuple(numbers), gauss))

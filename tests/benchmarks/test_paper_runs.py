@@ -20,10 +20,12 @@ from benchmarks import (
     run_estimates,
     subcommands,
 )
+from benchmarks.loss_table import LossRow
 from benchmarks.paper_runs import Run, RunTime, Session, State
+from benchmarks.paper_tables import Result
 from dpl.commands import dry_run
 from dpl.config import CONF
-from dpl.evaluation.tables import read
+from dpl.evaluation.tables import read, write
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = OmegaConf.to_container(OmegaConf.load(ROOT / "benchmarks/conf/paper.yaml"))
@@ -50,18 +52,15 @@ def planned(groups=None, more=()):
 
 
 def test_expected_times_are_those_of_the_published_tables(tmp_path):
-    head = "method,loads,generation_minutes,training_minutes"
-    rows = [
-        "fcnn,in range,6,10",
-        "fcnn,twice,6,10",
-        "linear,in range,,",
-        "POD-Galerkin,in range,6,1",
-    ]
-    (tmp_path / "beam_svk.csv").write_text("\n".join([head, *rows]))
-    (tmp_path / "propeller_nh.csv").write_text("\n".join([head, "fcnn,in range,7,20"]))
-    (tmp_path / "losses.csv").write_text("runs,seeds,training_minutes\nfcnn-mse,2,3")
+    def rows(minutes, generation):
+        times = {"generation_minutes": generation, "training_minutes": minutes}
+        return [Result("linear", "in range", 1), Result("fcnn", "in range", 1, 1, **times)]
+
+    write(rows(10.0, 6.0), tmp_path / "beam_svk.csv")
+    write(rows(20.0, 7.0), tmp_path / "propeller_nh.csv")
+    write([LossRow("fcnn-mse", 2, *[0.0] * 7, 3.0)], tmp_path / "losses.csv")
     runs = [*planned().values(), Run("one", "beam_nh_loss/fcnn", ())]
-    assert run_estimates.estimates(runs, tmp_path) == {
+    assert run_estimates.expected_minutes(runs, tmp_path) == {
         "beam_svk/fcnn": 10,
         "propeller_nh/fcnn": 20,
         "beam_nh_loss/fcnn": 15,  # the mean of those of the other experiments

@@ -20,7 +20,8 @@ from dpl.models import FCNN
 from dpl.models.linear_base import sampled_solutions
 from dpl.training import MSE, AtomicCheckpointIO, LrPlus, LrStar, Surrogate, warmup_cosine
 from dpl.training.checkpoints import read
-from dpl.training.surrogate import random_states, scales, set_random_states
+from dpl.training.random_states import random_states, set_random_states
+from dpl.training.surrogate import scales
 
 CONF = Path(__file__).parents[2] / "conf"
 METRICS = {
