@@ -269,7 +269,7 @@ def measured(
         amplitude, _ = scene.loads.project(load.force)
         if newton is not None and newton.outside_error > 0 and amplitude < 1 + ROUNDOFF:
             known = modes
-        reported = estimate_error(scene.linear, load, u, in_modes=known)
+        reported = estimate_error(scene.linear, load, u, in_modes=known).error
         yield Estimate("", "", "", error, corotational, modes, reported)
 
 

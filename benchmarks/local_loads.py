@@ -15,6 +15,7 @@ from dpl.export import ExportGraph, OnnxSession, export_onnx
 from dpl.export.comparison import relative_differences
 from dpl.export.onnx_graph import Array, missing_packages
 from dpl.fem import Load, PatchLoads, PointLoads, solve
+from dpl.inference import Simulator
 from dpl.models import Unrolled
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
@@ -41,6 +42,8 @@ class LocalLoads:
         linear_p50, linear_p99: Percentiles of the relative error of the linear solution [-].
         error_p50, error_p99: The same of the prediction, against Newton [-].
         predict_p50, predict_p99: Percentiles of the wall time of a prediction [ms].
+        sim_error_p50, sim_error_p99: Percentiles of the relative error of `sim(force)` [-].
+        sim_p50, sim_p99: Percentiles of the wall time of `sim(force)` [ms].
         onnx_p50, onnx_p99: The same of the ONNX graph; None if its packages are missing.
         onnx_error: Largest relative difference of graph and prediction [-]; None like these.
     """
@@ -54,6 +57,10 @@ class LocalLoads:
     error_p99: float
     predict_p50: float
     predict_p99: float
+    sim_error_p50: float
+    sim_error_p99: float
+    sim_p50: float
+    sim_p99: float
     onnx_p50: float | None = None
     onnx_p99: float | None = None
     onnx_error: float | None = None
@@ -67,7 +74,7 @@ def measure(surrogate: Surrogate, count: int, *, repeats: int = 1) -> Iterator[L
         count: Number of loads of each kind.
         repeats: Number of timed calls with each load.
     """
-    scene = surrogate.scene
+    scene, simulator = surrogate.scene, Simulator(surrogate)
     session = None
     if not missing_packages():
         with tempfile.TemporaryDirectory() as folder:
@@ -76,7 +83,7 @@ def measure(surrogate: Surrogate, count: int, *, repeats: int = 1) -> Iterator[L
             session = OnnxSession(path)
     with one_thread():
         for name, deflection, load in kinds(scene, count):
-            yield _row(surrogate, session, name, deflection, load, repeats)
+            yield _row(simulator, session, name, deflection, load, repeats)
 
 
 def kinds(scene: Scene, count: int) -> Iterator[tuple[str, float | None, Load]]:
@@ -89,14 +96,14 @@ def kinds(scene: Scene, count: int) -> Iterator[tuple[str, float | None, Load]]:
 
 
 def _row(
-    surrogate: Surrogate,
+    simulator: Simulator,
     session: OnnxSession | None,
     name: str,
     deflection: float | None,
     load: Load,
     repeats: int,
 ) -> LocalLoads:
-    scene = surrogate.scene
+    surrogate, scene = simulator.surrogate, simulator.scene
     both = [(one, solve(scene.newton, one)) for one in load.unbatch()]  # together: much memory
     singles = [one for one, solution in both if solution.converged]
     exact = torch.cat([solution.displacement for _, solution in both if solution.converged])
@@ -110,16 +117,24 @@ def _row(
     }
     times = latency(surrogate.predict, singles, repeats=repeats)
     numbers |= {"predict_p50": times.p50, "predict_p99": times.p99}
+    inputs: list[dict[str, Any]] = [scene.si_inputs(one) for one in singles]
+    answers = torch.cat([simulator(**one).displacement for one in inputs]) / scene.length
+    numbers |= _percentiles("sim_error", relative_differences(answers.numpy(), exact.numpy()))
+    times = latency(lambda one: simulator(**one), inputs, repeats=repeats)
+    numbers |= {"sim_p50": times.p50, "sim_p99": times.p99}
     if session is not None:
-        numbers |= _graph_numbers(session, scene, singles, found, repeats)
+        numbers |= _graph_numbers(session, scene, inputs, found, repeats)
     return LocalLoads(name, deflection, len(singles), **numbers)
 
 
 def _graph_numbers(
-    session: OnnxSession, scene: Scene, singles: list[Load], found: Tensor, repeats: int
+    session: OnnxSession,
+    scene: Scene,
+    inputs: list[dict[str, Any]],
+    found: Tensor,
+    repeats: int,
 ) -> dict[str, float]:
     """Return latencies of a graph and its largest difference from predictions (B, N, D) [-]."""
-    inputs = [scene.si_inputs(one) for one in singles]
     arrays = [{key: part.numpy() for key, part in one.items()} for one in inputs]
     times = latency(lambda one: session(**one), arrays, repeats=repeats)
     graph = np.concatenate([session(**one) for one in arrays]) / scene.length

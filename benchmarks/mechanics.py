@@ -283,16 +283,20 @@ def local(cfg: DictConfig, backends: list[str]) -> None:
     if not isinstance(surrogate.net, Unrolled):
         raise config.ConfigError(f"run = {cfg.run} must be a run of model=unrolled")
     rows = list(local_loads.measure(surrogate, cfg.count, repeats=cfg.repeats))
-    table = Table("loads, p50 and p99", "linear error", "error", "predict [ms]", "ONNX [ms]")
+    titles = "error", "of sim(force)", "predict [ms]", "sim(force)", "ONNX"
+    table = Table("loads, p50 and p99", *titles)
     for row in rows:
-        size = "" if row.deflection is None else f", up to {row.deflection:g} L"
+        size = "" if row.deflection is None else f", {row.deflection:g} L"
         errors = (
-            f"{row.linear_p50:.1e} {row.linear_p99:.1e}",
             f"{row.error_p50:.1e} {row.error_p99:.1e}",
+            f"{row.sim_error_p50:.1e} {row.sim_error_p99:.1e}",
         )
-        graph = "" if row.onnx_p50 is None else f"{row.onnx_p50:.2f} {row.onnx_p99:.2f}"
-        times = f"{row.predict_p50:.2f} {row.predict_p99:.2f}", graph
-        table.add_row(f"{row.count} {row.loads}{size}", *errors, *times)
+        times = (
+            f"{row.predict_p50:.1f} {row.predict_p99:.1f}",
+            f"{row.sim_p50:.1f} {row.sim_p99:.1f}",
+            "" if row.onnx_p50 is None else f"{row.onnx_p50:.1f} {row.onnx_p99:.1f}",
+        )
+        table.add_row(f"{row.loads}{size}", *errors, *times)
     CONSOLE.print(table)
     stem = Path(cfg.folder) / f"local_loads_{Path(cfg.run).name}"
     write(rows, stem.with_suffix(".csv"))

@@ -6,7 +6,12 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.inference.answer import Answer
-    from dpl.inference.error_estimate import corotational_error, estimate_error, nearest
+    from dpl.inference.error_estimate import (
+        corotational_correction,
+        corotational_error,
+        estimate_error,
+        nearest,
+    )
     from dpl.inference.grasp import GraspAnswer, Gripper
     from dpl.inference.hybrid import (
         Corrected,

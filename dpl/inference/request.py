@@ -4,6 +4,8 @@ import math
 import time
 from typing import Any, NamedTuple, Self
 
+from torch import Tensor
+
 from dpl.fem import Solution
 from dpl.fem.problem import Evaluation
 from dpl.fem.solvers import check_tol
@@ -19,6 +21,7 @@ class Candidate(NamedTuple):
         state: The solution.
         error: Its estimated relative error [-]; None: not computed.
         error_in_modes: Its estimated error by the modes of the model [-]; infinite: unknown.
+        correction: The correction behind its estimated error, (1, N, D) [-]; None: not computed.
         evaluation: Internal force and min det F at its displacement, if known.
     """
 
@@ -26,6 +29,7 @@ class Candidate(NamedTuple):
     state: Solution
     error: float | None = None
     error_in_modes: float = math.inf
+    correction: Tensor | None = None
     evaluation: Evaluation | None = None
 
     @property
@@ -73,6 +77,11 @@ class Request(NamedTuple):
         """True if other methods may follow the prediction."""
         return (self.tol, self.budget_ms, self.error) != (None, None, None)
 
+    @property
+    def is_for_error(self) -> bool:
+        """True if the estimated error alone decides which solution is best."""
+        return self.tol is None and (self.error is not None or self.budget_ms is None)
+
     def residual_tol(self, scene: Scene) -> float:
         """Return the residual below which a solution counts as converged [-]."""
         return scene.solver.tol if self.tol is None else self.tol
@@ -99,10 +108,11 @@ class Request(NamedTuple):
         """Return the key by which solutions are sorted; the smallest is best.
 
         It is whether they are not converged, whether an element is inverted, and the estimated
-        error if that has a tolerance, else the residual.
+        error if that has a tolerance or nothing has, else the residual.
         """
         state = candidate.state
-        size = float(state.residual) if self.error is None else candidate.known_error
+        by_error = self.error is not None or self.is_for_error
+        size = candidate.known_error if by_error else float(state.residual)
         valid = bool(state.volume_ratio > 0)
         return not bool(state.converged), not valid, size if size == size else math.inf
 

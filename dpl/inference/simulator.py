@@ -38,7 +38,8 @@ class Simulator:
 
     Called with a force alone, it returns the prediction with its residual and its estimated error.
     If the model comes with Newton's method in its modes, it makes steps of this method while the
-    error in the modes is too large. With a tolerance for the residual or the estimated error, it
+    error in the modes is too large, and a corotational correction and further steps if the
+    estimated error is too large then. With a tolerance for the residual or the estimated error, it
     tries network, linear solution, hybrid and Newton in this order until the tolerance is met; with
     a budget, while there is time. It keeps the last displacement as an initial guess of the next
     call (`warm`).
@@ -46,7 +47,7 @@ class Simulator:
     Attributes:
         surrogate: The surrogate.
         newton: Newton's method in the modes of the model; None: predictions are not corrected.
-        steps: Largest number of its steps.
+        steps: Largest number of its steps and of corotational corrections together.
     """
 
     def __init__(
@@ -58,7 +59,7 @@ class Simulator:
             surrogate: A trained surrogate on the CPU.
             newton: Newton's method in the modes of the model; None: that of a model which
                 `HasCorrection`.
-            steps: Largest number of its steps; 0: predictions are not corrected.
+            steps: Largest number of steps, see the attributes; 0: predictions are not corrected.
 
         Raises:
             ValueError: `steps` is negative.
@@ -129,9 +130,9 @@ class Simulator:
                 are met.
             budget_ms: Wall time of each load [ms]. An iteration is not started if the time of the
                 last iteration exceeds the rest of the budget.
-            error: Estimated relative error of the result [-]. A model with modes makes steps of
-                Newton's method in them first, at most `steps`, while its error within the modes is
-                above `error`; it also does so if `error` is left out, with 1e-3.
+            error: Estimated relative error of the result [-]. The prediction of a model with modes
+                is corrected first, by at most `steps` steps, while its error is above `error`; it
+                also is if `error` is left out, with 1e-3 in the modes and 2e-3 in the whole.
             warm: Start from the last displacement if it is nearer to equilibrium than the
                 prediction.
             stability: Factorise the tangent at the result to determine its stability.
@@ -284,13 +285,13 @@ class Simulator:
         if candidate.error is not None:
             return candidate
         begin = time.perf_counter()
-        error = estimate_error(
+        found = estimate_error(
             self.scene.linear, load, candidate.state.displacement, candidate.evaluation,
             in_modes=candidate.error_in_modes,
             sufficient=sufficient if request.error is None else request.error,
         )  # fmt: skip
         self._estimate_time = time.perf_counter() - begin
-        return candidate._replace(error=error)
+        return candidate._replace(error=found.error, correction=found.correction)
 
     def _candidates(
         self, load: Load, prediction: Tensor, place: RangeCheck, request: Request
@@ -298,8 +299,8 @@ class Simulator:
         """Yield the solutions of the methods, the cheapest first; see `_solve`."""
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
         self._pace = self._first_pace
-        first = self._corrected(load, prediction, request)
-        yield first._replace(error_in_modes=math.inf) if place.outside else first
+        for first in self._predictions(load, prediction, place, request):
+            yield first  # the last one is the best
         if not request.is_more_than_prediction:
             return
         clock = time.perf_counter()
@@ -323,17 +324,44 @@ class Simulator:
                 continue
             yield Candidate("hybrid" if state.from_guess else "full Newton", state)
 
-    def _corrected(self, load: Load, prediction: Tensor, request: Request) -> Candidate:
-        """Return the prediction, corrected by Newton's steps in the modes."""
+    def _predictions(
+        self, load: Load, prediction: Tensor, place: RangeCheck, request: Request
+    ) -> Iterator[Candidate]:
+        """Yield the prediction after steps in the modes, then corrections of it where they help.
+
+        A correction is the corotational one, which reduces the error outside the modes, followed by
+        steps in the modes, which reduce the error that it adds there. Corrections follow while the
+        estimated error is too large and decreases.
+        """
+        last = self._in_modes(load, prediction, place, request)
+        if self.newton is not None and request.is_for_error:
+            last = self._with_error(load, last, request)
+        yield last
+        sufficient = SUFFICIENT if request.error is None else request.error
+        while last.correction is not None and last.known_error > sufficient:
+            taken = int(last.state.iterations) + 1
+            if taken > self.steps or request.over(2 * self._estimate_time):
+                return
+            guess = last.state.displacement + last.correction
+            following = self._in_modes(load, guess, place, request, taken=taken)
+            following = self._with_error(load, following, request)
+            if not following.known_error < last.known_error:
+                return
+            yield (last := following)
+
+    def _in_modes(
+        self, load: Load, guess: Tensor, place: RangeCheck, request: Request, *, taken: int = 0
+    ) -> Candidate:
+        """Return a displacement after Newton's steps in the modes; `taken` steps precede them."""
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
-        if self.newton is None or not prediction.abs().amax().isfinite():
-            return _evaluated("network", problem, prediction, load, tol)
+        if self.newton is None or not guess.abs().amax().isfinite():
+            return _evaluated("network", problem, guess, load, tol)
         wanted = ERROR if request.error is None else request.error
         if request.tol is not None:
             wanted = min(wanted, self.newton.error_tol)
         begin, pace = time.perf_counter(), 0.0
         states = self.newton.states(
-            load, guess=prediction, error_tol=wanted, max_iter=self.steps,
+            load, guess=guess, error_tol=wanted, max_iter=self.steps - taken,
             is_over=lambda: request.over(pace + self._estimate_time),
         )  # fmt: skip
         first = next(states)
@@ -341,12 +369,12 @@ class Simulator:
         *_, state = first, *states
         solution = evaluate_solution(
             problem, state.displacement, load, tol,
-            iterations=state.iterations, from_guess=True, evaluation=state.evaluation,
+            iterations=taken + state.iterations, from_guess=True, evaluation=state.evaluation,
         )  # fmt: skip
         outside = self.newton.outside_error  # 0 if it is not known
-        within = state.error + outside if outside > 0 else math.inf
-        method = "corrected" if state.iterations else "network"
-        return Candidate(method, solution, None, within, state.evaluation)
+        within = state.error + outside if outside > 0 and not place.outside else math.inf
+        method = "corrected" if taken + state.iterations else "network"
+        return Candidate(method, solution, error_in_modes=within, evaluation=state.evaluation)
 
     def _with_stability(self, load: Load, state: Solution) -> Solution:
         """Return a solution with the number of negative eigenvalues of its tangent."""

@@ -57,7 +57,7 @@ def test_the_command_writes_a_row_for_each_kind(script, tiny, tmp_path, monkeypa
     assert ended.status == 0, ended.err
     rows = read(LocalLoads, tmp_path / "runs/benchmark/local_loads_a.csv")
     assert len(rows) == 5
-    assert "2 point force, up to 0.001 L" in ended.out
+    assert "point force, 0.001 L" in ended.out
 
 
 def test_a_run_of_unrolled_has_to_be_named(script, tiny_training, tmp_path):
