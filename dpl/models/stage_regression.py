@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -148,7 +148,8 @@ def fit_map(rows: Rows, held_out: Rows, action: GroupAction) -> RidgeFit:
             _weighted_rows(component, coordinates, part, image)
             for part, image in zip((rows, held_out), images, strict=True)
         ]
-        parts.append(_ComponentFit(component, coordinates, *_normal_equations(*sets[0]), *sets[1]))
+        equations = _NormalEquations.of(*sets[0])
+        parts.append(_ComponentFit(component, coordinates, equations, *sets[1]))
     best, chosen, least = _best_ridge(parts)
     maps = [p.whole(m, action, shape) for p, m in zip(parts, best, strict=True)]
     matrix = action.with_exact_parity(torch.stack(maps).sum(dim=0), shape[1])
@@ -168,7 +169,7 @@ def _best_ridge(parts: "Sequence[_ComponentFit]") -> tuple[list[Tensor], int, fl
         if number in tried or not 0 <= number < len(RIDGES):
             return float("inf")
         tried.add(number)
-        matrices = [m for part in parts if (m := part.solve(RIDGES[number])) is not None]
+        matrices = [m for part in parts if (m := part.equations.solve(RIDGES[number])) is not None]
         if len(matrices) < len(parts):
             return float("inf")
         squares = [p.squared_errors(m) for p, m in zip(parts, matrices, strict=True)]
@@ -189,31 +190,62 @@ def _best_ridge(parts: "Sequence[_ComponentFit]") -> tuple[list[Tensor], int, fl
     return best
 
 
+class _NormalEquations(NamedTuple):
+    """Normal equations of features X, whose columns are divided by their norms, and targets Y.
+
+    A ridge regression with fewer rows than features is solved in as many unknowns as rows, with the
+    same result: (X^H X + r)^-1 X^H Y = X^H (X X^H + r)^-1 Y.
+
+    Attributes:
+        gram: X^H X, (p, p), or X X^H, (n, n).
+        right: X^H Y, (p, R), or Y, (n, R).
+        adjoint: X^H, (p, n), in the latter case.
+        factors: 1 over the norm of each feature, (p,); 0 for features of rounding errors. There are
+            such features at cells that symmetries map onto themselves.
+    """
+
+    gram: Tensor
+    right: Tensor
+    adjoint: Tensor | None
+    factors: Tensor
+
+    @classmethod
+    def of(cls, X: Tensor, Y: Tensor) -> Self:
+        """Return the equations of features (n, p) and targets (n, R)."""
+        scale = torch.linalg.vector_norm(X, dim=0)
+        factors = torch.where(scale > ROUNDING * scale.max(), 1 / scale, 0.0)
+        X = X * factors
+        if len(X) < X.shape[1]:
+            return cls(X @ X.mH, Y, X.mH, factors)
+        return cls(X.mH @ X, X.mH @ Y, None, factors)
+
+    def solve(self, ridge: float) -> Tensor | None:
+        """Return the matrix (p, R) of a ridge; None if the equations are singular."""
+        shifted = self.gram.clone()
+        shifted.diagonal().add_(ridge * len(self.factors))
+        factor, failed = torch.linalg.cholesky_ex(shifted)
+        if failed:
+            return None
+        solution = torch.cholesky_solve(self.right, factor)
+        whole = solution if self.adjoint is None else self.adjoint @ solution
+        return whole * self.factors[:, None]
+
+
 class _ComponentFit(NamedTuple):
     """Normal equations of an isotypic component, and its held-out rows.
 
     Attributes:
         component: The component.
         coordinates: See `Component.coordinate_parts`, (d, R, R).
-        gram, product: Of features that are divided by `scale`, (p, p) and (p, R).
-        scale: Root sum of squares of each feature, (p,).
+        equations: The normal equations.
         features, targets: Held-out rows, (S d, p) and (S d, R).
     """
 
     component: Component
     coordinates: Tensor
-    gram: Tensor
-    product: Tensor
-    scale: Tensor
+    equations: _NormalEquations
     features: Tensor
     targets: Tensor
-
-    def solve(self, ridge: float) -> Tensor | None:
-        """Return the matrix (p, R) of a ridge; None if the equations are singular."""
-        shifted = self.gram.clone()
-        shifted.diagonal().add_(ridge * len(shifted))
-        factor, failed = torch.linalg.cholesky_ex(shifted)
-        return None if failed else torch.cholesky_solve(self.product, factor) / self.scale[:, None]
 
     def squared_errors(self, matrix: Tensor) -> Tensor:
         """Return the component of the squared error of each held-out sample, (S,)."""
@@ -243,15 +275,3 @@ def _weighted_rows(
     weights = rows.weights[:, None, None]
     targets = torch.einsum("sa,jab->sjb", rows.targets.to(parts.dtype), parts)
     return (component.parts(images) * weights).flatten(0, 1), (targets * weights).flatten(0, 1)
-
-
-def _normal_equations(X: Tensor, Y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return X^H X and X^H Y with the columns of X divided by their norms, and these norms.
-
-    The norm of columns of rounding errors is infinity. There are such columns at cells that
-    symmetries map onto themselves.
-    """
-    gram, product = X.mH @ X, X.mH @ Y
-    scale = gram.diagonal().real.sqrt()
-    scale = torch.where(scale > ROUNDING * scale.max(), scale, torch.inf)
-    return gram / scale[:, None] / scale, product / scale[:, None], scale

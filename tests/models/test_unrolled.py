@@ -287,7 +287,13 @@ def test_ridge_regression_finds_an_exact_map():
     features = torch.randn(60, 2, 1, 3, 3, generator=random).double()
     matrix = torch.randn(18, 4, generator=random).double()
     rows = Rows(features, features.flatten(1) @ matrix, torch.ones(60).double())
-    one = GroupAction(
+    found = fit_map(rows, rows, no_symmetry())
+    assert (found.matrix - matrix).abs().max() < 1e-8
+
+
+def no_symmetry():
+    """Return the action of the group of the identity on two cells and four coordinates."""
+    return GroupAction(
         torch.eye(3)[None].double(),
         torch.arange(2)[None],
         torch.eye(4)[None].double(),
@@ -295,8 +301,28 @@ def test_ridge_regression_finds_an_exact_map():
         Parities.of([], 3),
         torch.zeros(4, dtype=torch.int64),
     )
-    found = fit_map(rows, rows, one)
-    assert (found.matrix - matrix).abs().max() < 1e-8
+
+
+@pytest.mark.parametrize("count", [12, 18, 40], ids=["fewer rows", "as many", "more"])
+def test_ridge_regression_is_that_of_the_normal_equations(count):
+    """Also with fewer rows than features, and with a feature that is rounding error."""
+    random = torch.Generator().manual_seed(0)
+    features = torch.randn(count + 30, 2, 1, 3, 3, generator=random).double()
+    features[:, 1, 0, 2, 2] *= 1e-12
+    targets = torch.randn(count + 30, 4, generator=random).double()
+    every = Rows(features, targets, torch.rand(count + 30, generator=random).double())
+    rows, held_out = (
+        Rows(*(x[part] for x in every)) for part in (slice(count), slice(count, None))
+    )
+    found = fit_map(rows, held_out, no_symmetry())
+    X = rows.weights[:, None] * rows.features.flatten(1)[:, :-1]
+    scale = X.norm(dim=0)
+    shift = 18 * found.ridge * torch.eye(17).double()
+    gram = (X / scale).T @ (X / scale) + shift
+    right = (X / scale).T @ (rows.weights[:, None] * rows.targets)
+    expected = torch.linalg.solve(gram, right) / scale[:, None]
+    assert found.matrix[:-1] == pytest.approx(expected, rel=1e-5, abs=1e-8)
+    assert not found.matrix[-1].any()
 
 
 def test_fields_of_definite_parity(beam, net):
