@@ -138,10 +138,9 @@ PARTS = (
         "6 and figures 5 to 7 of the paper. Shapes are coloured by the nodal error.",
     ),
     Part(
-        r"pareto_(beam_svk|propeller_nh)",
+        r"pareto_(beam_nh_loss|propeller_nh)",
         "Run time against error on `{0}`",
-        "python scripts/pareto.py run=runs/{0} folder=benchmarks/results "
-        "discretisation=benchmarks/results/discretisation_{0}.csv",
+        "python scripts/pareto.py run=runs/{0} folder=benchmarks/results",
         "Figure and file contain every iterate of every solver.",
         tabulated=False,
     ),

@@ -19,6 +19,9 @@ from dpl.visualization import DPI, STYLE, method_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.text import Annotation
+    from matplotlib.transforms import Bbox
 
 Cells = tuple[int, ...]
 WORDS = {
@@ -148,13 +151,14 @@ def draw(
     `floor` [-], are relative to the limit under refinement; they have a panel of their own.
     """
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator
 
     with plt.rc_context(STYLE):
         count = 2 if meshes else 1
         figure = plt.figure(figsize=(4.0 * count + 1.0, 4.2), layout="constrained")
         ratios = [1.6, 1.0][:count]
         axes = figure.subplots(1, count, squeeze=False, width_ratios=ratios)[0]
-        _draw_methods(axes[0], rows)
+        labels = _draw_methods(axes[0], rows)
         if meshes:
             _draw_meshes(axes[1], meshes)
         if floor is not None:
@@ -166,15 +170,24 @@ def draw(
         for ax in axes:
             ax.set_xlabel("time of one load [ms], median")
             ax.xaxis.set_major_formatter("{x:g}")
+            ax.xaxis.set_minor_formatter("")
             ax.grid(visible=True)
+        axes[0].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes[0].set_ylabel("relative error, median of the loads")
+        _separate(figure, labels)
         figure.savefig(file, dpi=DPI)
         plt.close(figure)
 
 
-def _draw_methods(ax: "Axes", rows: Sequence[Point]) -> None:
-    """Draw each family of solvers in one colour: dots of predictions, lines of iterates."""
+def _draw_methods(ax: "Axes", rows: Sequence[Point]) -> list["Annotation"]:
+    """Draw each family of solvers in one colour: dots of predictions, lines of iterates.
+
+    Returns:
+        The names of the families.
+    """
     from matplotlib.patheffects import withStroke
+
+    labels = []
 
     families = {name: _family(name) for name in dict.fromkeys(row.solver for row in rows)}
     colours = method_colours(dict.fromkeys(families.values()))
@@ -196,20 +209,30 @@ def _draw_methods(ax: "Axes", rows: Sequence[Point]) -> None:
             ax.loglog(x[-1:], y[-1:], color=colour, ms=7, marker=MARKERS.get(method, "o"))
             ends.append((x[0], y[0]))
         if ends:
-            place = min(ends)
-            above = family != "linear"  # which is near the predictions of poor networks
-            ax.annotate(
-                family, place, color=colour, weight="bold", ha="center",
-                va="bottom" if above else "top", xytext=(0, 7 if above else -7),
-                textcoords="offset points", fontsize=8.5,
+            label = ax.annotate(
+                family, min(ends), color=colour, weight="bold", ha="center", va="bottom",
+                xytext=(0, 7), textcoords="offset points", fontsize=8.5,
                 path_effects=[withStroke(linewidth=3, foreground="white")],
             )  # fmt: skip
-    ax.set_ylim(top=3)
+            labels.append(label)
+    ax.set_ylim(top=10)
     used = {name.partition(", ")[2] for name in families}
     for method, words in WORDS.items():
         if method in used:
             ax.plot([], [], color="0.5", ls="", marker=MARKERS.get(method, "o"), label=words)
     ax.legend(loc="lower left")
+    return labels
+
+
+def _separate(figure: "Figure", labels: Sequence["Annotation"]) -> None:
+    """Raise labels of points until none overlaps another one, from the lowest to the highest."""
+    figure.draw_without_rendering()
+    placed: list[Bbox] = []
+    for label in sorted(labels, key=lambda label: label.get_window_extent().y0):
+        while any(label.get_window_extent().overlaps(other) for other in placed):
+            x, y = label.get_position()
+            label.set_position((x, y + 2))
+        placed.append(label.get_window_extent())
 
 
 def _family(name: str) -> str:
