@@ -183,12 +183,11 @@ def _draw_methods(ax: "Axes", rows: Sequence[Point]) -> list["Annotation"]:
     """Draw each family of solvers in one colour: dots of predictions, lines of iterates.
 
     Returns:
-        The names of the families.
+        The labels with the names of the families.
     """
     from matplotlib.patheffects import withStroke
 
     labels = []
-
     families = {name: _family(name) for name in dict.fromkeys(row.solver for row in rows)}
     colours = method_colours(dict.fromkeys(families.values()))
     final = {name: [row for row in rows if row.solver == name][-1] for name in families}
