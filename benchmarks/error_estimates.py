@@ -254,7 +254,7 @@ def measured(
         samples: Loads with their solutions.
         predict: Function from a load to displacements, (B, N, D) [-].
         newton: Newton's method in the modes of the model; None: the estimate in modes is NaN.
-        stepped: Correct the prediction by `newton` first, as the simulator does.
+        stepped: Correct the prediction by `newton` first, with which the simulator begins, too.
     """
     for load, exact in zip(samples.load.unbatch(), samples.displacement, strict=True):
         u, modes = predict(load), math.nan
