@@ -283,7 +283,7 @@ def local(cfg: DictConfig, backends: list[str]) -> None:
     if not isinstance(surrogate.net, Unrolled):
         raise config.ConfigError(f"run = {cfg.run} must be a run of model=unrolled")
     rows = list(local_loads.measure(surrogate, cfg.count, repeats=cfg.repeats))
-    titles = "error", "of sim(force)", "predict [ms]", "sim(force)", "ONNX"
+    titles = "error", "of sim(force)", "predict [ms]", "sim [ms]", "ONNX [ms]"
     table = Table("loads, p50 and p99", *titles)
     for row in rows:
         size = "" if row.deflection is None else f", {row.deflection:g} L"

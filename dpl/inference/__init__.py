@@ -7,6 +7,7 @@ from dpl.system.lazy import public_names
 if TYPE_CHECKING:
     from dpl.inference.answer import Answer
     from dpl.inference.error_estimate import (
+        ErrorEstimate,
         corotational_correction,
         corotational_error,
         estimate_error,

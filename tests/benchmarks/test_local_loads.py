@@ -58,6 +58,7 @@ def test_the_command_writes_a_row_for_each_kind(script, tiny, tmp_path, monkeypa
     rows = read(LocalLoads, tmp_path / "runs/benchmark/local_loads_a.csv")
     assert len(rows) == 5
     assert "point force, 0.001 L" in ended.out
+    assert [r.count for r in rows if (r.loads, r.deflection) == ("point force", 1e-3)] == [2]
 
 
 def test_a_run_of_unrolled_has_to_be_named(script, tiny_training, tmp_path):
