@@ -8,6 +8,7 @@
 # make paper: trains all runs of the paper's tables, hours on two cores; again: continues. Then tables
 #   and figures in benchmarks/results. ARGS="only_plan=true", "scale=small" (minutes), "groups=[full]".
 # make matrix: the tests under other processor features and thread numbers; see tests/matrix.py.
+# make tables: the numbers of benchmarks/results/ into the tables of docs/.
 # make docs:  the documentation into site/.
 # make pictures: executes gallery and notebooks and stores their pictures, and the one that moves.
 PYTHON ?= python3
@@ -20,7 +21,7 @@ DEMO := $(BIN)/python scripts/train.py mesh=paper_beam data.train=64 data.val=16
   model=unrolled model.rank=60 model.cells=80 run=runs/demo
 BEAM := mesh=paper_beam data.train=256 data.val=32 data.test=50
 
-.PHONY: setup train demo paper test lint slow gpu matrix mutants docs pictures wheel clean
+.PHONY: setup train demo paper test lint slow gpu matrix mutants tables docs pictures wheel clean
 
 setup: .venv/installed
 
@@ -73,6 +74,9 @@ matrix: setup
 mutants: setup
 	$(PIP) -e '.[mutation]'
 	$(BIN)/python tests/mutants.py $(ARGS)
+
+tables:
+	$(PYTHON) docs/make/tables.py
 
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -f docs/make/mkdocs.yml

@@ -61,7 +61,7 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
-    """Rewrite links to files as links to pages, link names of the package, fill in numbers."""
+    """Rewrite links to files as links to pages, link names of the package."""
     path = page.file.src_uri
     if path.startswith("api/"):
         return markdown
@@ -69,7 +69,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
         markdown = links.rewritten(markdown, INCLUDED[path], path)
     elif (DOCS / path).is_file():
         markdown = gallery.shown(markdown) if path == gallery.PAGE.name else markdown
-        markdown = links.rewritten(measured.filled(markdown), f"docs/{path}", path)
+        markdown = links.rewritten(markdown, f"docs/{path}", path)
     elif path.startswith("notebooks/"):
         source = (NOTEBOOKS / path.removeprefix("notebooks/")).with_suffix(".ipynb")
         markdown = links.rewritten(markdown, str(source.relative_to(ROOT)), path)

@@ -10,7 +10,6 @@ from pathlib import Path
 from paths import RESULTS
 
 Row = dict[str, str]
-VALUE = re.compile(r"\{\{ *(?P<stem>\w+):(?P<which>[^{}]*): *(?P<column>\w+) *\}\}")
 
 
 @dataclass(frozen=True)
@@ -323,18 +322,23 @@ def table(rows: list[Row]) -> Iterator[str]:
     yield "| " + " | ".join(column.replace("_", " ") for column in columns) + " |"
     yield "|" + " --- |" * len(columns)
     for row in rows:
-        yield "| " + " | ".join(shown(row[c]) for c in columns) + " |"
+        yield "| " + " | ".join(shown(row[c], c) for c in columns) + " |"
     yield ""
 
 
-def shown(text: str) -> str:
-    """Return a number with at most three digits and separated thousands; other text as it is."""
+def shown(text: str, column: str = "") -> str:
+    """Return a number with at most three digits and separated thousands; other text as it is.
+
+    Signal-to-noise ratios [dB] have one decimal.
+    """
     try:
         number = float(text)
     except ValueError:
         return text.replace("|", "\\|")
     if number != number or abs(number) == float("inf"):
         return text
+    if column.startswith("SNR"):
+        return f"{number:.1f}"
     if number == int(number) and abs(number) < 1e12:
         return f"{int(number):,}"
     if 1e-3 <= abs(number) < 1e4:
@@ -343,30 +347,20 @@ def shown(text: str) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
-def filled(text: str) -> str:
-    """Return a text with `{{ file: column=value; column=value: column }}` replaced by numbers.
-
-    Raises:
-        LookupError: Not exactly one row matches.
-    """
-    return VALUE.sub(lambda match: shown(value(**match.groupdict())), text)
-
-
-def value(stem: str, which: str, column: str) -> str:
+def value(csv: str, column: str, which: dict[str, str]) -> str:
     """Return one number of a file.
 
     Args:
-        stem: Stem of the file in benchmarks/results/.
-        which: `column=value` of its row, separated by semicolons.
+        csv: Stem of the file in benchmarks/results/.
         column: Column of the number.
+        which: Values of other columns that select its row.
 
     Raises:
         LookupError: Not exactly one row matches.
     """
-    wanted = dict(pair.strip().split("=", 1) for pair in which.split(";"))
-    found = [row for row in read(stem) if all(row[c] == x for c, x in wanted.items())]
+    found = [row for row in read(csv) if all(row[c] == x for c, x in which.items())]
     if len(found) != 1:
-        raise LookupError(f"results/{stem}.csv: {len(found)} rows match {wanted}")
+        raise LookupError(f"results/{csv}.csv: {len(found)} rows match {which}")
     return found[0][column]
 
 

@@ -150,14 +150,50 @@ def test_a_result_of_no_known_command_is_refused(make, tmp_path, monkeypatch):
         measured.page()
 
 
-def test_numbers_of_results_are_filled_in_and_ambiguous_ones_refused(make):
-    measured = make("measured")
-    number = next(r for r in measured.read("beam_svk") if r["method"] == "paper")["e_mean"]
-    assert measured.filled("{{ beam_svk: method=paper: e_mean }}") == measured.shown(number)
-    with pytest.raises(LookupError, match="rows match"):
-        measured.filled("{{ beam_svk: loads=in range: e_mean }}")
-    for path in DOCS.glob("*.md"):
-        assert "{{" not in measured.filled(path.read_text(encoding="utf-8")), path
+TABLE = """<!-- results: csv=beam_svk; loads=in range
+| e_mean | e_max, SNR_min |
+-
+method=paper
+-->
+
+| | a | b | c |
+|---|---|---|---|
+| one | | 2 | 3 |
+| two | | | 4 |
+"""
+
+
+def test_the_stored_tables_are_those_of_the_results(make):
+    """`make tables` writes them."""
+    tables = make("tables")
+    assert len(tables.pages()) > 5
+    for path in tables.pages():
+        text = path.read_text(encoding="utf-8")
+        assert len(tables.BLOCK.findall(text)) == text.count("<!-- results"), path
+        assert tables.updated(text) == text, path
+
+
+def test_a_table_has_the_numbers_that_its_comment_names(make):
+    measured, tables = make("measured"), make("tables")
+    rows = {row["method"]: row for row in measured.read("beam_svk") if row["loads"] == "in range"}
+    names = ("e_mean", "e_max", "SNR_min")
+    mean, largest, snr = (measured.shown(rows["paper"][name], name) for name in names)
+    row = f"| two | {mean} | {largest}, {snr} | 4 |"
+    assert tables.updated(TABLE) == TABLE.replace("| two | | | 4 |", row)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("csv=beam_svk; loads=in range", "csv=beam_svk; loads=small", "0 rows match"),
+        ("method=paper", "count=100", "1[0-9] rows match"),
+        ("-\n", "", "1 rows for a table of 2"),
+        ("| two | | | 4 |", "| two | | 4 |", "table of 4 columns has the row"),
+    ],
+)
+def test_a_table_that_differs_from_its_comment_is_refused(make, old, new, message):
+    with pytest.raises(LookupError, match=message):
+        make("tables").updated(TABLE.replace(old, new, 1))
 
 
 @pytest.mark.parametrize(
