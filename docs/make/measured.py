@@ -69,7 +69,7 @@ PARTS = (
         "Parameters of several materials: `{0}`",
         "python scripts/results.py name={0} galerkin=null corrected=null",
         "Networks with parameters of the material as inputs, see "
-        "[materials in space](materials.md).",
+        "[heterogeneous bodies](materials.md).",
         split="loads",
     ),
     Part(
@@ -125,7 +125,7 @@ PARTS = (
         "python scripts/convergence.py run=runs/hybrid_newton_hard "
         "networks=[unrolled,fcnn] name=hybrid_newton_hard tols=[1e-6] count=100 twice=false "
         "n_far_loads=0 max_plain_iterations=6 "
-        "\"solvers=[plain Newton,'hybrid, paper\\'s rule','hybrid, best rule']\" "
+        "\"solvers=[plain Newton,'hybrid, paper\\'s rule','hybrid, natural monotonicity']\" "
         "folder=benchmarks/results",
         "100 loads of `experiment=hybrid_newton_hard`, one at a time on one thread.",
     ),

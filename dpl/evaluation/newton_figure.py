@@ -16,7 +16,7 @@ LINES = {
     "plain Newton": ("plain Newton", "0.1", "-"),
     REFERENCE: (REFERENCE, "0.1", "--"),
     "hybrid, paper's rule": ("paper's hybrid", COLOURS[1], "-"),
-    "hybrid, best rule": ("our hybrid", COLOURS[0], "-"),
+    "hybrid, natural monotonicity": ("our hybrid", COLOURS[0], "-"),
 }
 QUANTITIES = (("iterations", "iterations"), ("ms", "time [ms]"))
 

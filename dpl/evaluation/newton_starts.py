@@ -158,8 +158,8 @@ def solvers_of(
     }
     for name, predict in networks.items():
         solvers["hybrid, paper's rule", name] = Hybrid(predict, plain, "paper")
-        solvers["hybrid, best rule, factors", name] = Hybrid(predict, robust)
-        solvers["hybrid, best rule", name] = Hybrid(predict, quick)
+        solvers["hybrid, natural monotonicity, factors", name] = Hybrid(predict, robust)
+        solvers["hybrid, natural monotonicity", name] = Hybrid(predict, quick)
         anderson = AndersonSolver(quick)
         solvers["hybrid, without tangents", name] = Hybrid(predict, quick, steps=anderson)
     known = list(dict.fromkeys(name for name, _ in solvers))

@@ -71,7 +71,7 @@ def test_a_run_on_a_mesh_file_says_what_it_is_and_what_was_corrected(trained):
     _, _, ended = trained
     lines = ended.err.splitlines()
     assert [line for line in lines if line.startswith("warning: ") and "part.vtu" in line] == [
-        "warning: part.vtu: 24 of 96 cells list their nodes inside out; they are reordered; "
+        "warning: part.vtu: 24 of 96 cells are inverted; their nodes are reordered; "
         "1 nodes belong to no cell; they are dropped"
     ]
     size = "body      100 x 25 x 25 m, 45 nodes, 96 tetrahedra, 135 degrees of freedom"

@@ -114,7 +114,10 @@ def test_each_solver_has_a_summary(scene, loads, networks, tol):
     reference = by[newton_starts.REFERENCE, ""]
     assert reference.time_ratio == 1.0
     assert reference.used_prediction_pct is None
-    best, useless = by["hybrid, best rule", "near"], by["hybrid, best rule", "nan"]
+    best, useless = (
+        by["hybrid, natural monotonicity", "near"],
+        by["hybrid, natural monotonicity", "nan"],
+    )
     assert (best.used_prediction_pct, useless.used_prediction_pct) == (100, 0)
     assert best.iterations < reference.iterations
     assert best.deviation < 10 * tol
@@ -238,7 +241,7 @@ def test_lines_are_labelled_and_labels_do_not_overlap(monkeypatch, tmp_path):
     monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: kept.append(self))
     solvers = [("plain Newton", ""), (newton_starts.REFERENCE, "")]
     for network in ("a", "b"):
-        solvers += [("hybrid, paper's rule", network), ("hybrid, best rule", network)]
+        solvers += [("hybrid, paper's rule", network), ("hybrid, natural monotonicity", network)]
     trials = [
         Trial(*solver, "in range", 1e-6, k, k != 3, True, 3 + k, 1, 10.0 + k, 0.0)
         for solver in solvers

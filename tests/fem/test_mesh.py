@@ -352,19 +352,19 @@ def test_quadratic_hexahedra_keep_their_volume(tmp_path):
 
 
 INSIDE_OUT = {  # file with cells the other way round, and the words of the warning
-    "hexahedron": (TWO_CUBES, TWO_HEXES[:, [4, 5, 6, 7, 0, 1, 2, 3]], "2 of 2 .* inside out"),
+    "hexahedron": (TWO_CUBES, TWO_HEXES[:, [4, 5, 6, 7, 0, 1, 2, 3]], "2 of 2 .* inverted"),
     "one hexahedron": (
         *(TWO_CUBES, np.stack([TWO_HEXES[0], TWO_HEXES[1, [4, 5, 6, 7, 0, 1, 2, 3]]])),
-        "1 of 2 cells list their nodes inside out; they are reordered$",
+        "1 of 2 cells are inverted; their nodes are reordered$",
     ),
-    "tetra": (CORNERS, TETS[:, [1, 0, 2, 3]], "5 of 5 cells .* inside out"),
+    "tetra": (CORNERS, TETS[:, [1, 0, 2, 3]], "5 of 5 cells .* inverted"),
     "one tetra": (
         *(CORNERS, np.concatenate([TETS[:4], TETS[4:, [1, 0, 2, 3]]])),
-        "1 of 5 cells .* inside out",
+        "1 of 5 cells .* inverted",
     ),
     "triangle": (
         *(PATCH, np.concatenate([FAN[:3], FAN[3:, ::-1]])),
-        "1 of 4 cells list their nodes clockwise, unlike the others; they are reordered",
+        "1 of 4 cells list their nodes clockwise, unlike the others; their nodes are reordered",
     ),
     "quad": (
         np.concatenate([PATCH[:4], PATCH[:4][[3, 2]] + np.array([0, 1, 0])]),

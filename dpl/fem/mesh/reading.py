@@ -164,8 +164,8 @@ def _repairs(shape: type[Refdom], nodes: Array, unused: int) -> list[str]:
     backwards = int((np.linalg.det(J) < 0).sum())
     plane = len(fit) == 2  # may be seen from either side
     if backwards and not (plane and backwards == len(J)):
-        how = "clockwise, unlike the others" if plane else "inside out"
-        repairs.append(f"{backwards} of {len(J)} cells list their nodes {how}; they are reordered")
+        how = "list their nodes clockwise, unlike the others" if plane else "are inverted"
+        repairs.append(f"{backwards} of {len(J)} cells {how}; their nodes are reordered")
     if unused:
         repairs.append(f"{unused} nodes belong to no cell; they are dropped")
     return repairs
