@@ -46,8 +46,12 @@ class PlainNewton:
             raise ValueError(f"step_tol = {self.step_tol} must be 0 or more")
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
-        """Yield the state of all loads at a guess (B, N, D) [-], or zero, and after each step."""
-        starts = torch.zeros_like(load.force) if guess is None else guess
+        """Yield the state of all loads at a guess (B, N, D) [-], or zero, and after each step.
+
+        Each state has the prescribed displacements of the supports.
+        """
+        free, starts = self.problem.free, torch.zeros_like(load.force) if guess is None else guess
+        starts = torch.where(free, starts, self.problem.prescribed)
         pairs = zip(load.unbatch(), starts, strict=True)
         return run_lockstep([self._member(one, u[None], guess is not None) for one, u in pairs])
 

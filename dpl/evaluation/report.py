@@ -139,9 +139,9 @@ def evaluate(
         errors: Estimated relative errors of the simulator [-].
     """
     scene, simulator = surrogate.scene, Simulator(surrogate)
-    tight = min(tols)
+    tight, linear = min(tols), _own(scene).linear_solver
     solvers: dict[str, Solver] = {
-        "linear": replace(_own(scene).linear_solver, tol=tight),
+        "linear": replace(linear, tol=tight, parent=linear),  # with its factor
         PREDICTION: Direct(surrogate.predict, scene.problem, tight),
         **_step_in_modes(surrogate, tight),
         f"paper's hybrid to {power(tight)}": Hybrid(

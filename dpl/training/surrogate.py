@@ -125,8 +125,9 @@ class Surrogate(L.LightningModule):
         field = field.to(self.dtype)
         if not self._has_coordinates:  # a network with coordinates whitens these
             field = base.whiten(field)
-        output = self.unscale_outputs(self.net(field, **more))
-        return linear + base.gate(amplitude)[:, None, None] * output
+        output = self.net(field, **more).double() * self.displacement_scale
+        nonlinear = base.gate(amplitude)[:, None, None] * output
+        return linear + torch.where(self.physics.problem.free, nonlinear, 0.0)
 
     def scale_inputs(self, load: Load) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the inputs of the network: scaled forces (B, N, D), and its extra inputs by name.
@@ -160,8 +161,8 @@ class Surrogate(L.LightningModule):
         """Return displacements over L (B, N, D) [-], float64, from outputs of the network."""
         if self._is_closed_form:
             return output
-        displacement = output.double() * self.displacement_scale
-        return torch.where(self.physics.problem.free, displacement, 0.0)
+        problem, displacement = self.physics.problem, output.double() * self.displacement_scale
+        return torch.where(problem.free, displacement, problem.prescribed)
 
     def describe(self) -> list[tuple[str, str]]:
         """Return name and size of the network, and the loss."""

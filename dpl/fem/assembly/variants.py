@@ -168,6 +168,14 @@ class BodyVariants(EquilibriumCriterion):
         del twin.__dict__["moved_supports"]
         return twin
 
+    @cached_property
+    def support_force(self) -> Tensor:
+        """K(0) times the prescribed displacement plus the follower loads at rest, (N, D) [-]."""
+        if not self.moved_supports:
+            return self.force_at_rest
+        rest, moved = self.prescribed.new_zeros(1, *self.shape), self.prescribed[None]
+        return self.without_follower_loads.tangent_product(rest, moved)[0] + self.force_at_rest
+
     def _share(self, twin: Self) -> Self:
         """Return another body on the same mesh with the parts that do not depend on the law."""
         for name in ("pattern", "moved_supports", "_operator"):

@@ -71,8 +71,7 @@ class ReducedProblem:
         cells: The cells, with the basis W = V L^-T in which K(0) is the identity.
         stiffness: K(0) W of the cells, (C A D, R).
         stiffness_error: I - W^T K(0) W of the cells, (R, R).
-        support_force: K(0) prescribed, (N, D); zero if no support is moved.
-        reduced_support_force: W^T K(0) prescribed, (R,).
+        reduced_support_force: W^T `Problem.support_force`, (R,).
     """
 
     def __init__(
@@ -89,8 +88,7 @@ class ReducedProblem:
         one = torch.eye(rank, dtype=torch.float64)
         self.stiffness_error = one - self.cells.basis.T @ self.stiffness
         self._white_rows = white.flatten(0, 1)
-        self.support_force = support_force(problem)
-        self.reduced_support_force = self.project(self.support_force)
+        self.reduced_support_force = self.project(problem.support_force)
 
     def project(self, force: Tensor) -> Tensor:
         """Return W^T f, (R,), of f (N, D)."""
@@ -111,7 +109,7 @@ class ReducedProblem:
         scale = norm(reduced - pull)
         offset, moves = problem.prescribed, self.lift is not None or problem.moved_supports
         if self.lift is not None:
-            offset = offset + _linear_solution(self.lift, force - self.support_force)
+            offset = offset + _linear_solution(self.lift, force - problem.support_force)
             pull = reduced
         cell_offset = offset[self.cells.nodes].flatten() if moves else offset
         error = pull - cell_offset @ self.stiffness if moves else pull
@@ -215,20 +213,10 @@ def beyond_linear(problem: Problem, snapshots: Tensor, lift: LinearSolver | None
     """Return equilibria (S, N, D) minus their linear solutions at free DOFs, (S, n)."""
     rest = snapshots[:, problem.free].double()
     if lift is not None:
-        supports = support_force(problem)
         for row, u in zip(rest, snapshots, strict=True):
-            force = problem.evaluate(u[None]).internal[0] - supports
+            force = problem.evaluate(u[None]).internal[0] - problem.support_force
             row -= _linear_solution(lift, force)[problem.free]
     return rest
-
-
-def support_force(problem: Problem) -> Tensor:
-    """Return K(0) prescribed plus the follower loads on the body at rest, (N, D)."""
-    if not problem.moved_supports:
-        return problem.force_at_rest
-    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    elastic = problem.without_follower_loads
-    return elastic.tangent_product(rest, problem.prescribed[None])[0] + problem.force_at_rest
 
 
 def _linear_solution(lift: LinearSolver, force: Tensor) -> Tensor:

@@ -152,14 +152,16 @@ class LinearSolver:
         yield evaluate_solution(self.problem, u, load, self.tol, iterations=1, seconds=seconds)
 
     def solve(self, force: Tensor) -> Tensor:
-        """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero at supports.
+        """Return the linear solution, (N, D) [-], under a force (N, D) [-].
 
-        f includes follower loads as dead loads on the body at rest.
+        It has the prescribed displacements of the supports, and follower loads are dead loads on
+        the body at rest.
         """
-        return self.solve_force(force - self.problem.force_at_rest)
+        problem = self.problem
+        return problem.prescribed + self.solve_force(force - problem.support_force)
 
     def solve_force(self, force: Tensor) -> Tensor:
-        """Return K(0)^-1 f as `solve` does, without follower loads."""
+        """Return K(0)^-1 f, (N, D) [-], of a force alone; zero at supports."""
         return self.problem.extend(self.factor.solve(self.problem.restrict(force)))
 
     def __getstate__(self) -> dict[str, object]:
