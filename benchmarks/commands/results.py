@@ -45,9 +45,9 @@ def main(cfg: DictConfig) -> None:
 def measure(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
     from benchmarks import learning_curves, paper_tables
+    from dpl.commands.pareto import trained_methods
     from dpl.evaluation import methods
     from dpl.evaluation.tables import show
-    from dpl.models import Correctable
 
     runs = config.load_runs(cfg.run, cfg.networks)
     first, surrogate = next(iter(runs.values()))
@@ -56,23 +56,9 @@ def measure(cfg: DictConfig) -> None:
     if cfg.single:
         _single(cfg, scene, data.samples("test"), {n: s.predict for n, (_, s) in runs.items()})
         return
-    train = data.samples("train")
-
-    def made(key: str, *parts: object) -> methods.Method:
-        try:
-            return config.instantiate(cfg, key)(*parts)
-        except ValueError as error:
-            raise config.ConfigError(f"{key}: {error}; {key}=null leaves it out") from error
-
     compared = {"linear": methods.linear(scene)}
-    if cfg.galerkin:
-        compared["POD-Galerkin"] = made("galerkin", scene, train)
-    for name, (trained, surrogate) in runs.items():
-        loads = config.training_loads(trained, scene)
-        method = methods.network(surrogate, Path(cfg.run) / name, loads)
-        compared[name] = method
-        if cfg.corrected and isinstance(surrogate.net, Correctable):
-            compared[name + paper_tables.CORRECTED] = made("corrected", surrogate, method, train)
+    for (name, variant), method in trained_methods(cfg, runs, data).items():
+        compared[name + (paper_tables.CORRECTED if variant else "")] = method
     sets = paper_tables.load_sets(scene, data.samples("test"), cfg.count)
     rows, errors = paper_tables.paper(cfg.name), {}
     a_load = data.store.seconds_per_load()

@@ -109,6 +109,7 @@ def _quieten_lightning() -> None:
         ".*LeafSpec",
         "The number of training batches",
         "Checkpoint directory .* exists",
+        "The dirpath has changed",
     ):
         warnings.filterwarnings("ignore", message)
 
@@ -175,8 +176,13 @@ def apply_extras(cfg: DictConfig) -> None:
         print(OmegaConf.to_yaml(cfg, resolve=True))
 
 
-def check_trainer(trainer: Any, cfg: DictConfig) -> None:
+def check_trainer(trainer: Any, cfg: DictConfig, *, has_schedule: bool = True) -> None:
     """Check a trainer against the rest of a configuration before the training.
+
+    Args:
+        trainer: The trainer.
+        cfg: The configuration.
+        has_schedule: Whether the training uses `scheduler`; a fit in one step does not.
 
     Raises:
         ConfigError: A learning-rate schedule over an unlimited training, callbacks that write no
@@ -186,7 +192,7 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
 
     from dpl.training import checkpoints
 
-    if cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
+    if has_schedule and cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
         _check_schedule_in_time(cfg)
     if not trainer.fast_dev_run and not any(
         checkpoints.writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks
@@ -237,7 +243,7 @@ def best_error(trainer: Any) -> float | None:
             return float(score) if math.isfinite(score) else math.inf
     if HydraConfig.get().mode == RunMode.MULTIRUN and "direction" in HydraConfig.get().sweeper:
         raise ConfigError(
-            "trainer.check_val_every_n_epoch: no epoch was validated, and the search has no value "
-            "to minimise; validate more often or train longer"
+            "trainer.limit_val_batches: no validation error is stored, and the search has no value "
+            "to minimise; set it above 0 and keep callbacks.best_weights"
         )
     return None

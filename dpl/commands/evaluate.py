@@ -11,8 +11,6 @@ from dpl.commands.cli import command
 @command("evaluate")
 def main(cfg: DictConfig) -> None:
     """Print and write the errors and run times of a surrogate on its test set."""
-    if not cfg.tols:
-        raise config.ConfigError("tols = [] must name one tolerance or more")
     trained, surrogate = config.load_run(cfg.run, trust=cfg.trust)
     test = config.load_data(trained, surrogate.scene).samples("test")
     evaluation.evaluate(surrogate, test, Path(cfg.run), tols=cfg.tols, errors=cfg.errors)

@@ -14,6 +14,9 @@ from dpl.commands.cli import command
 from dpl.evaluation import tables
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from dpl.evaluation.methods import Method
     from dpl.evaluation.pareto import Discretisation, Point
 
 
@@ -69,29 +72,59 @@ def _solvers(cfg: DictConfig) -> tuple["dpl.Scene", dict[str, "fem.Solver"], "dp
     """Return the scene of the runs, all solvers including their networks, and the test loads."""
     import torch
 
-    from dpl.evaluation import methods, pareto
+    from dpl.evaluation import pareto
 
     runs = config.load_runs(cfg.run, trust=cfg.trust)
     first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
     data = config.load_data(first, scene)
-    train = data.samples("train")
     robust = scene.newton
     solvers: dict[str, fem.Solver] = {"linear": scene.linear}
     solvers |= {f"Newton to {tol:g}": replace(robust, tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
-    if cfg.galerkin:
-        model = config.instantiate(cfg, "galerkin")(scene, train)
-        solvers["POD-Galerkin"] = dpl.Direct(model.predict, scene.problem)
-    for name, (trained, surrogate) in runs.items():
-        predict = surrogate.predict
-        solvers[name] = dpl.Direct(predict, scene.problem)
-        if cfg.corrected and isinstance(surrogate.net, models.Correctable):
-            loads = config.training_loads(trained, scene)
-            row = methods.network(surrogate, Path(cfg.run) / name, loads)
-            method = config.instantiate(cfg, "corrected")(surrogate, row, train)
-            solvers[f"{name}, corrected"] = dpl.Direct(method.predict, scene.problem)
-        solvers[f"{name}, hybrid"] = inference.default_hybrid(predict, scene)
+    for (name, variant), method in trained_methods(cfg, runs, data).items():
+        title = f"{name}, {variant}" if variant else name
+        solvers[title] = dpl.Direct(method.predict, scene.problem)
+    for name, (_, surrogate) in runs.items():
+        solvers[f"{name}, hybrid"] = inference.default_hybrid(surrogate.predict, scene)
         if torch.cuda.is_available():
             copy = config.load_run(Path(cfg.run) / name, trust=cfg.trust, scene=scene)[1]
             solvers[f"{name}, GPU"] = dpl.Direct(pareto.on_gpu(copy), scene.problem)
     return scene, solvers, data.samples("test")
+
+
+def trained_methods(
+    cfg: DictConfig,
+    runs: "Mapping[str, tuple[DictConfig, dpl.Surrogate]]",
+    data: "dpl.OfflineData",
+) -> dict[tuple[str, str], "Method"]:
+    """Return POD-Galerkin, the networks and the corrected networks, by name and variant.
+
+    The variant is "corrected" or empty. Reduced models are made from the training samples, or from
+    the validation samples of a run that has none on disk.
+
+    Raises:
+        ConfigError: `galerkin` or `corrected` cannot be made for this scene and these samples.
+    """
+    from dpl.evaluation import methods
+
+    found: dict[tuple[str, str], Method] = {}
+    if cfg.galerkin:
+        found["POD-Galerkin", ""] = _made(cfg, "galerkin", data.scene, data.snapshots())
+    for name, (trained, surrogate) in runs.items():
+        loads = config.training_loads(trained, data.scene)
+        plain = methods.network(surrogate, Path(cfg.run) / name, loads)
+        found[name, ""] = plain
+        if cfg.corrected and isinstance(surrogate.net, models.Correctable):
+            samples = data.snapshots()
+            found[name, "corrected"] = _made(cfg, "corrected", surrogate, plain, samples)
+    return found
+
+
+def _made(cfg: DictConfig, key: str, *parts: object) -> "Method":
+    """Return the method of a key; raise a `ConfigError` with the remedy if it cannot be made."""
+    make = config.instantiate(cfg, key)
+    try:
+        made: Method = make(*parts)
+    except ValueError as error:
+        raise config.ConfigError(f"{key}: {error}; {key}=null leaves it out") from error
+    return made

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 import dpl
 from dpl import config, evaluation, models, training
@@ -28,7 +28,8 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", Any, "dpl.Surrogate", Any]:
     if resumed is not None:
         config.check_weights(surrogate, resumed, grows=data.growth is not None)
     trainer = config.build_trainer(cfg)
-    cli.check_trainer(trainer, cfg)
+    has_schedule = not isinstance(surrogate.net, models.ClosedFormFit)
+    cli.check_trainer(trainer, cfg, has_schedule=has_schedule)
     if resumed is not None:
         config.check_callbacks(trainer, resumed)
     if data.growth is not None:
@@ -95,8 +96,8 @@ def _train(cfg: DictConfig) -> float | None:
         if leaving.code == 128 + signal.SIGTERM:
             raise
         if trainer.is_global_zero and session.begun:
-            resume = f"{_script('train')} {_run_key(folder)} ckpt_path=last"
-            print(f"to resume: {resume}", file=sys.stderr)
+            words = [_script("train"), _run_key(folder), "ckpt_path=last", *session_overrides()]
+            print(f"to resume: {' '.join(words)}", file=sys.stderr)
         raise KeyboardInterrupt from leaving
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         ours = isinstance(error, config.ConfigError | DataSetError | training.Diverged)
@@ -144,6 +145,25 @@ def show_next_commands(folder: Path, *, tensorboard: bool) -> None:
         own = _own_folder()
         program = str(own / "tensorboard") if own else "tensorboard"
         print(f"  {program} --logdir {shlex.quote(_from_here(folder))}", flush=True)
+
+
+def session_overrides() -> list[str]:
+    """Return the overrides, as they are typed, that a resumed run does not read from its folder.
+
+    Options of groups may have been chosen by another option, such as `debug`.
+    """
+    from dpl.config.resume import OF_THE_SESSION
+
+    job, groups = HydraConfig.get(), OF_THE_SESSION - {"run", "folder", "ckpt_path"}
+    defaults = OmegaConf.load(config.CONF / "train.yaml").defaults
+    usual = dict(pair for one in defaults if isinstance(one, DictConfig) for pair in one.items())
+    chosen = {key: name for key, name in job.runtime.choices.items() if key in groups}
+    found = [f"{key}={name}" for key, name in chosen.items() if name != usual.get(key)]
+    for line in job.overrides.task:
+        key = line.lstrip("+~").partition("=")[0]
+        if key not in chosen and key.partition(".")[0] in groups:
+            found.append(shlex.quote(line))
+    return found
 
 
 def _from_here(folder: Path) -> str:

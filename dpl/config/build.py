@@ -160,11 +160,10 @@ def require_keys(cfg: DictConfig, *keys: str) -> None:
 def build_scene(cfg: DictConfig) -> Scene:
     """Return the scene of a configuration; raise a `ConfigError` that names the invalid key."""
     require_keys(cfg, *SCENE)
-    is_range = isinstance(cfg.young, ListConfig | DictConfig)
-    young = OmegaConf.to_container(cfg.young) if is_range else cfg.young
+    young, ends = _young(cfg), moduli(cfg)
     forces = _parts(cfg, "forces")
     follower = {name: f for name, f in forces.items() if isinstance(f, FollowerLoad)}
-    problem = _problem(cfg, _one_modulus(young), follower)
+    problem = _problem(cfg, ends.low if ends.low == ends.high else None, follower)
     dead = {name: force for name, force in forces.items() if name not in follower}
     always = _constant_force(dead, problem)
     solver = instantiate(cfg, "solver", problem=problem)
@@ -176,16 +175,18 @@ def build_scene(cfg: DictConfig) -> Scene:
     return Scene(problem, loads, solver)
 
 
-def _one_modulus(young: Any) -> float | None:
-    """Return the modulus of all loads [Pa]; None if they have a range of moduli.
+def _young(cfg: DictConfig) -> Any:
+    """Return the value of `young`, a mapping or a list if it is a range [Pa]."""
+    is_range = isinstance(cfg.young, ListConfig | DictConfig)
+    return OmegaConf.to_container(cfg.young) if is_range else cfg.young
 
-    Raises a `ConfigError` if `young` is out of range.
-    """
+
+def moduli(cfg: DictConfig) -> YoungRange:
+    """Return the range of Young's moduli of all loads; raise a `ConfigError` if it is invalid."""
     try:
-        moduli = YoungRange.of(young)
+        return YoungRange.of(_young(cfg))
     except ValueError as error:  # its message names the key
         raise ConfigError(str(error)) from error
-    return moduli.low if moduli.low == moduli.high else None
 
 
 def _constant_force(dead: dict[str, Any], problem: Problem) -> Tensor | None:
@@ -282,13 +283,19 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "training.Surrogate":
 
 
 def build_trainer(cfg: DictConfig) -> "L.Trainer":
-    """Return the trainer of a configuration with its callbacks and loggers."""
+    """Return the trainer of a configuration with its callbacks and loggers.
+
+    Raises a `ConfigError` if the machine, the options and the callbacks do not fit together.
+    """
+    from lightning.fabric.utilities.exceptions import MisconfigurationException
+
     require_keys(cfg, "trainer")
     callbacks, loggers = (list(_parts(cfg, key).values()) for key in ("callbacks", "logger"))
     more: dict[str, Any] = {"callbacks": callbacks, "logger": loggers or False}
     if (limit := cfg.trainer.get("max_time")) is not None:
         more["max_time"] = _time_limit(limit)
-    return typing.cast("L.Trainer", instantiate(cfg, "trainer", **more))
+    with error_in("trainer", MisconfigurationException):
+        return typing.cast("L.Trainer", instantiate(cfg, "trainer", **more))
 
 
 def _time_limit(limit: str | DictConfig) -> datetime.timedelta:

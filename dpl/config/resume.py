@@ -18,9 +18,10 @@ from dpl.fem import write_mesh_exactly
 from dpl.system.files import atomic_write
 
 OF_THE_SESSION = {"run", "folder", "ckpt_path", "callbacks", "logger", "paths", "extras"}
+MACHINE = tuple(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy"))
 MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
     *(f"trainer.max_{unit}" for unit in ("epochs", "steps", "time")),
-    *(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy")),
+    *MACHINE,
     *("trainer.log_every_n_steps", "trainer.check_val_every_n_epoch", "trainer.profiler"),
     *("trainer.enable_progress_bar", "trainer.enable_model_summary"),
     *("data.workers", "data.timeout", "data.error", "data.minutes", "data.max_train", "tags"),
@@ -60,6 +61,7 @@ def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
 
     It is `cfg`, that of the command line, where no run is resumed, and where the command line names
     an option that changes several groups, such as `experiment`: it then has to repeat all of them.
+    An option of the group `trainer` changes the machine alone.
 
     Raises:
         ConfigError: The configuration of the run cannot be read, or it calls an object outside this
@@ -92,7 +94,9 @@ def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         elif root not in requested:
             return cfg
         else:
-            OmegaConf.update(found, key, OmegaConf.select(given, key), merge=False)
+            machine = [one for one in MACHINE if OmegaConf.select(given, one) is not None]
+            for place in machine if key == "trainer" else [key]:
+                OmegaConf.update(found, place, OmegaConf.select(given, place), merge=False)
     return found
 
 

@@ -1,6 +1,8 @@
 """Read the folder of a training run."""
 
 import contextlib
+import math
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -20,15 +22,21 @@ from dpl.config.build import (
     check,
     hyperparameters,
     instantiate,
+    moduli,
     require_keys,
 )
 from dpl.config.validation import ConfigError
+from dpl.fem import moduli_of
 from dpl.fem import read_mesh as load_mesh
+from dpl.fem.mesh.generators import longest_side
 from dpl.scene import Scene
 from dpl.system.memory import at_most
 
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
 MAX_BYTES = 100_000  # of the configuration of a run
+CANNOT_BE_READ = (  # errors of a checkpoint that is damaged or of another run
+    *(OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError),
+)
 
 
 def has_mesh_file(cfg: DictConfig) -> bool:
@@ -75,9 +83,13 @@ def load_run(
 ) -> tuple[DictConfig, "training.Surrogate"]:
     """Return the configuration and the best surrogate of a training run.
 
+    If the run has chosen its number of training loads (`data.train=auto`), that of the best fit
+    replaces `auto` in the configuration.
+
     Args:
         folder: Folder of the run.
-        scene: Scene of the run, if it is built already.
+        scene: Scene of the run, if it is built already. It is used if it has the size and the
+            Young's moduli of the run, which its fingerprint does not contain.
         trust: Import and call objects outside this package, such as your own law, that the
             configuration names.
 
@@ -99,8 +111,10 @@ def load_run(
     check(cfg, trust=trust)
     with _usable(best):
         checkpoint = checkpoints.read(best)
-    if scene is None:
-        scene = _scene_of_run(cfg, best, checkpoint, trust=trust)
+        points = checkpoint.get("OfflineData", {}).get("points")
+        if points and OmegaConf.select(cfg, "data.train") == "auto":
+            cfg.data.train = int(points[-1][0])
+    scene = _scene_of_run(cfg, best, checkpoint, scene, trust=trust)
     surrogate = build_surrogate(cfg, scene)
     with _usable(best):
         surrogate.on_load_checkpoint(checkpoint)
@@ -112,15 +126,17 @@ def load_run(
 def _usable(checkpoint: Path) -> Iterator[None]:
     try:
         yield
-    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
+    except CANNOT_BE_READ as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(f"{checkpoint} cannot be used: {reason}") from error
 
 
 def _scene_of_run(
-    cfg: DictConfig, weights: Path, checkpoint: dict[str, Any], *, trust: bool
+    cfg: DictConfig, weights: Path, checkpoint: dict[str, Any], known: Scene | None, *, trust: bool
 ) -> Scene:
     """Return the scene of a run; a mesh file is read from the folder of the run.
+
+    It is `known` if that has the size and the Young's moduli of the run.
 
     Without `trust` the run needs a copy of its mesh file, and its checkpoint bounds the number of
     nodes: no network has fewer weights than its body has nodes.
@@ -129,7 +145,7 @@ def _scene_of_run(
     folder = weights.parent.parent
     own = with_copied_mesh(cfg, folder)
     if trust:
-        return build_scene(own)
+        return _reused_or_built(own, known)
     if own is cfg and has_mesh_file(cfg):
         raise ConfigError(
             f"mesh.path = {cfg.mesh.path} must be kept in the run's folder as {folder / MESH}; "
@@ -139,7 +155,17 @@ def _scene_of_run(
     if isinstance(nodes := checkpoint.get("nodes"), int):
         most = min(nodes, most)
     with at_most(most, f"{weights} is of no larger body"):
-        return build_scene(own)
+        return _reused_or_built(own, known)
+
+
+def _reused_or_built(cfg: DictConfig, known: Scene | None) -> Scene:
+    """Return a known scene if it has the size and the moduli of a configuration, else a new one."""
+    if known is None or moduli(cfg) != moduli_of(known.loads):
+        return build_scene(cfg)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # printed when the scene was built
+        length = longest_side(instantiate(cfg, "mesh").p.T)
+    return known if math.isclose(length, known.length) else build_scene(cfg)
 
 
 def load(
@@ -170,6 +196,8 @@ def load_runs(
 ) -> dict[str, tuple[DictConfig, "training.Surrogate"]]:
     """Return the configurations and surrogates of named runs in a folder, or of all, on one scene.
 
+    Sizes and ranges of Young's moduli may differ; a run that differs in them has its own scene.
+
     Raises:
         ConfigError: There are none, or one cannot be used or belongs to another scene.
     """
@@ -178,10 +206,16 @@ def load_runs(
     if not names:
         raise ConfigError(f"run = {folder} contains no runs; train some with run={folder}/NAME")
     runs: dict[str, tuple[DictConfig, training.Surrogate]] = {}
-    scene = None
+    scene: Scene | None = None
     for name in names:
         runs[name] = load_run(Path(folder) / name, trust=trust, scene=scene)
-        scene = runs[name][1].scene
+        own = runs[name][1].scene
+        scene = scene or own
+        if own.fingerprint != scene.fingerprint:
+            differences = "; ".join(scene.differences(own.identity()))
+            raise ConfigError(
+                f"run = {folder}: {name} is of another scene than {names[0]}: {differences}"
+            )
     return runs
 
 
@@ -195,7 +229,10 @@ def load_data(cfg: DictConfig, scene: Scene) -> "data.OfflineData":
 def training_loads(cfg: DictConfig, scene: Scene) -> int | None:
     """Return the number of training loads of a run; None for a stream.
 
-    If the run has chosen it (`data.train=auto`), it is the number of loads in the data set.
+    Args:
+        cfg: Configuration of the run from `load_run`. If `data.train` is still `auto`, the run has
+            not stored its number of loads, and the loads of its data set are counted.
+        scene: Scene of the run.
     """
     count: int | str | None = cfg.data.get("train")
     if count == "auto":

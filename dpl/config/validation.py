@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 Keys = Sequence[tuple[Any, ...]]  # rows of type, names, and smallest and largest value of keys
+BELOW_1 = math.nextafter(1.0, 0.0)  # largest value of a key that must be below 1
 KEYS: Keys = (  # of all commands
     (dict, "mesh material loads solver data model loss optimizer trainer"),
     (dict | None, "fixed regions supports forces scheduler callbacks logger paths extras"),
@@ -36,7 +37,8 @@ KEYS: Keys = (  # of all commands
     (int, "port", 0, 65535),
     (float, "tol", 1e-15, 1),
     (float, "step_tol", 0, math.inf),
-    (Sequence[float], "tols errors", 1e-15, 1),
+    (Sequence[float], "tols", 1e-15, BELOW_1),
+    (Sequence[float], "errors", 1e-15, 1),
     (Sequence[int | None], "threads", 1, 10**4),
     (float | Sequence[float] | Mapping[str, float | str], "young", 1e-30, 1e30),  # [Pa]
     (float, "young.low young.high", 1e-30, 1e30),
@@ -50,6 +52,7 @@ TRAINING: Keys = (  # of a training; the types are those of signatures, 1e-30 st
     (object, "trainer.limit_train_batches", 1e-30, 10**9),
 )
 UNLIMITED = {"trainer.max_epochs", "trainer.max_steps"}  # keys for which -1 means no limit
+NOT_EMPTY = {"tols", "threads"}  # lists that must name a value
 REGIONS = {f"dpl.fem.mesh.regions.{name}" for name in ("Plane", "Box", "Sphere", "Cylinder", "Tag")}
 EXPECTED_TYPES = {  # base classes of the object that the call under a key returns
     "mesh": {"skfem.mesh.mesh.Mesh"},
@@ -76,6 +79,10 @@ EXPECTED_TYPES = {  # base classes of the object that the call under a key retur
     "trainer": {"lightning.pytorch.trainer.trainer.Trainer"},
     "callbacks": {"lightning.pytorch.callbacks.callback.Callback"},
     "logger": {"lightning.pytorch.loggers.logger.Logger"},
+}
+CLASSES_OF_DATA = {  # base class of `data`, by a key of the commands that need it
+    "action": "dpl.data.dataset.DataSet",
+    "trainer": "dpl.data.datamodule.OfflineData",
 }
 PARTS_OF_LAWS = {  # base classes of the objects that a law may contain
     "dpl.fem.materials.cell_field.CellField",
@@ -134,7 +141,10 @@ def check(
             _check_value(path, node, *known[path])
             _check_keys(path, node, known)
         if isinstance(node, dict) and "_target_" in node:
-            _check_call(path, node, _target(path, node["_target_"], trust=trust))
+            target = _target(path, node["_target_"], trust=trust)
+            if path == "data":
+                _check_data(node["_target_"], target, resolved)
+            _check_call(path, node, target)
         elif _is_call(path, resolved) and node is not None:
             raise ConfigError(f"{path} = {node!r} must be a call: its _target_ is missing")
 
@@ -156,6 +166,16 @@ def _is_call(path: str, resolved: Mapping[str, Any]) -> bool:
     return len(below) == names_several(key, resolved.get(key)) and key in EXPECTED_TYPES
 
 
+def _check_data(name: str, target: Any, resolved: Mapping[str, Any]) -> None:
+    """Check that the class of `data` is the one that the command needs."""
+    for key, kind in CLASSES_OF_DATA.items():
+        if key in resolved and inspect.isclass(target) and not is_instance_of(target, {kind}):
+            raise ConfigError(
+                f"data._target_ = {name!r} must be dpl.data.{kind.rpartition('.')[2]} or a class "
+                "derived from it"
+            )
+
+
 def _check_value(
     key: str, value: Any, hint: Any, least: float = -math.inf, most: float = math.inf
 ) -> None:
@@ -163,11 +183,13 @@ def _check_value(
     plain = {} if isinstance(value, dict) else value  # calls are checked by their signatures
     if not matches_type(plain, hint):
         raise ConfigError(f"{key} = {value!r} must be {_describe(hint)}")
+    if value == [] and key in NOT_EMPTY:
+        raise ConfigError(f"{key} = [] must name one value or more")
     for one in value if isinstance(value, list) else [value]:
         unlimited = key in UNLIMITED and one == -1
         if isinstance(one, int | float) and not least <= one <= most and not unlimited:
-            span = f"between {least:g} and {most:.10g}{' or be -1' if key in UNLIMITED else ''}"
-            raise ConfigError(f"{key} = {value} must lie {span}")
+            more = " or be -1" if key in UNLIMITED else ", 1 excluded" if most == BELOW_1 else ""
+            raise ConfigError(f"{key} = {value} must lie between {least:g} and {most:.10g}{more}")
 
 
 def _check_keys(path: str, node: Any, known: Collection[str]) -> None:

@@ -119,7 +119,8 @@ class OfflineData(L.LightningDataModule):
         """Return one line for each kind of work that is not needed."""
         lines = self.dataset.skipped_work()
         if self.symmetry:
-            lines.append(f"{len(self.group)} samples of each load solved: symmetries of the body")
+            images = f"{len(self.group)} samples of each load solved, in gradient descent only"
+            lines.append(f"{images}: symmetries of the body")
         return lines
 
     def prepare_data(self) -> None:

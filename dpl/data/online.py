@@ -26,6 +26,13 @@ class OnlineData(OfflineData):
         self,
         scene: Scene,
         *,
+        folder: str | None = None,
+        seed: int = 0,
+        shuffle_seed: int = 0,
+        val: int = 100,
+        test: int = 100,
+        symmetry: bool = False,
+        timeout: float | None = 600.0,
         batches: int = 16,
         new_per_round: int = 8,
         reuse: int = 50,
@@ -34,12 +41,12 @@ class OnlineData(OfflineData):
         cache: bool = False,
         workers: int = 2,
         batch_size: int = 64,
-        **kwargs: object,
     ) -> None:
         """Check the arguments; those of `OfflineData` and the following.
 
         Args:
             scene: Scene of the loads.
+            shuffle_seed: Seed of the choice of samples, and of their images, for the batches.
             batches: Batches in an epoch.
             new_per_round: New samples after which batches are drawn again.
             reuse: Maximum number of uses of a sample.
@@ -49,7 +56,6 @@ class OnlineData(OfflineData):
             cache: Write solved loads to the data set, and read those that it has.
             workers: Number of processes that solve; 0: solve in this process, between the steps.
             batch_size: Samples in a batch.
-            kwargs: folder, seed, val, test, symmetry, timeout, see `OfflineData`.
 
         Raises:
             ValueError: A number is out of range, or options exclude each other.
@@ -60,6 +66,11 @@ class OnlineData(OfflineData):
             raise ValueError(
                 f"capacity = {capacity} must be at least new_per_round = {new_per_round}"
             )
+        if capacity * reuse < batch_size:
+            raise ValueError(
+                f"capacity * reuse = {capacity} * {reuse} must be at least batch_size = "
+                f"{batch_size}; take a larger data.capacity or data.reuse"
+            )
         needed = capacity * 2 * 8 * scene.problem.points.numel() / 1e9
         refuse_beyond(needed, machine(), f"{capacity} samples", "take a smaller data.capacity")
         check_range(0, 1, hard_example_fraction=hard_example_fraction)
@@ -68,7 +79,19 @@ class OnlineData(OfflineData):
                 "cache = true requires hard_example_fraction = 0, because a data set holds the "
                 "loads of its seed only; choose one of the two"
             )
-        super().__init__(scene, train=0, workers=workers, batch_size=batch_size, **kwargs)  # type: ignore[arg-type]
+        super().__init__(
+            scene,
+            folder=folder,
+            seed=seed,
+            shuffle_seed=shuffle_seed,
+            train=0,
+            val=val,
+            test=test,
+            batch_size=batch_size,
+            symmetry=symmetry,
+            workers=workers,
+            timeout=timeout,
+        )
         self._buffer_options = {
             "batches": batches,
             "new_per_round": new_per_round,
@@ -109,6 +132,7 @@ class OnlineData(OfflineData):
             stream,
             workers=self.workers,
             batch_size=self.batch_size,
+            seed=self._shuffle_seed,
             group=self.group,
             errors=self._errors,
             report=self._report,

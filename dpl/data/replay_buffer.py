@@ -58,6 +58,7 @@ class ReplayBuffer:
         new_per_round: New samples per round.
         reuse: Maximum number of uses of a sample.
         capacity: Number of samples that the buffer keeps.
+        seed: Seed of the choice of samples and images.
         group: Symmetries of the body, identity first: each use is that of a random image.
         errors: Returns the surrogate's errors on the last batch, (B,); called only if the stream
             has hard examples.
@@ -75,6 +76,7 @@ class ReplayBuffer:
     new_per_round: int
     reuse: int
     capacity: int
+    seed: int = 0
     group: Sequence[Symmetry] = ()
     errors: Callable[[], Tensor | None] = lambda: None
     report: Callable[[StreamRates], None] = lambda rates: None
@@ -87,7 +89,7 @@ class ReplayBuffer:
         self._buffer = _Buffer(self.capacity, self.reuse)
         self._stream: Any = None
         self._endless: Iterator[Sample] | None = None
-        self._generator = torch.Generator().manual_seed(0)
+        self._generator = torch.Generator().manual_seed(self.seed)
         self._used = self._restarts = 0
         self._waited = 0.0
 
@@ -170,8 +172,9 @@ class ReplayBuffer:
             return new
         except (RuntimeError, OSError, EOFError) as error:  # raised where a worker has died
             self._restarts += 1
-            died = "DataLoader worker" in str(error)
-            died |= bool(self.workers) and not isinstance(error, RuntimeError)
+            died = str(error).startswith("DataLoader worker (pid")
+            if self.workers and not isinstance(error, RuntimeError):
+                died = not str(error).startswith("Caught")  # the worker reports its own error
             if not died or self._restarts > MAX_CONSECUTIVE_CRASHES:
                 raise
             if self._restarts % MAX_RETRIES == 0:

@@ -98,8 +98,13 @@ def corrected(
     minutes = (method.training_minutes or 0.0) + (time.perf_counter() - start) / 60
 
     def predict(load: Load) -> Tensor:
-        pairs = zip(load.force, surrogate.predict(load), strict=True)
-        return torch.stack([solver.correct(f, u, steps=steps) for f, u in pairs])
+        pairs = zip(load.unbatch(), surrogate.predict(load), strict=True)
+        return torch.stack(
+            [
+                solver.correct(one.force[0], u, parameters=one.parameters[0], steps=steps)
+                for one, u in pairs
+            ]
+        )
 
     return Method(predict, method.samples, minutes, method.parameters)
 

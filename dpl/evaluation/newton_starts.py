@@ -55,6 +55,7 @@ class Trial(Setting):
         factorisations: Number of factorised tangents.
         ms: Wall time with the prediction [ms].
         deviation: Relative L2 distance from the solution of robust Newton [-].
+        step_tol, max_total_iter: Options of the solvers, see `solvers_of`.
     """
 
     number: int
@@ -64,6 +65,8 @@ class Trial(Setting):
     factorisations: int
     ms: float
     deviation: float
+    step_tol: float = 0.0
+    max_total_iter: int | None = None
 
 
 @dataclass(frozen=True)
@@ -175,15 +178,24 @@ def measure(
     load: Load,
     tol: float,
     tick: Callable[[], None] = lambda: None,
+    *,
+    step_tol: float = 0.0,
+    max_total_iter: int | None = None,
 ) -> list[Trial]:
     """Return the results of all solvers for all loads, one load at a time on one thread.
 
-    The solvers, by name and network, contain `REFERENCE` from rest. `title` and `tol` are those of
-    the loads and the solvers, for the record. `tick` is called after each load.
+    Args:
+        solvers: Solvers by name and network, which contain `REFERENCE` from rest.
+        title: Name of the set of loads, for the record.
+        load: The loads.
+        tol: Relative residual of the solvers, for the record [-].
+        tick: Called after each load.
+        step_tol, max_total_iter: Options of the solvers, for the record, see `solvers_of`.
     """
     with one_thread(), torch.inference_mode():
         timed = time_interleaved(solvers, load, tick)
     reference = timed[REFERENCE, ""][0].displacement.flatten(1)
+    options: dict[str, Any] = {"step_tol": step_tol, "max_total_iter": max_total_iter}
     trials = []
     for (name, network), (solution, times) in timed.items():
         distance = (solution.displacement.flatten(1) - reference).norm(dim=1)
@@ -192,7 +204,9 @@ def measure(
             times, distance / reference.norm(dim=1),
         )  # fmt: skip
         numbers = zip(*(column.tolist() for column in columns), strict=True)
-        trials += [Trial(name, network, title, tol, k, *row) for k, row in enumerate(numbers)]
+        trials += [
+            Trial(name, network, title, tol, k, *row, **options) for k, row in enumerate(numbers)
+        ]
     return trials
 
 

@@ -28,7 +28,7 @@ SCALING = (
     "scales.displacement output, the prescribed displacement at fixed degrees of freedom"
 )
 SCALING_OF_BASE = (
-    "v = linear solution over length, a = rms(v) / scales.displacement; input = whitened v / rms(v) "
+    "v = linear solution over length, a = rms(v) / scales.displacement; input = whitened v/rms(v) "
     "and a; network; displacement = length (v + scales.displacement a^2 / (1 + a) output)"
 )
 SCALING_OF_FIT = "input = force / (young force_unit); model; displacement = length output"

@@ -23,7 +23,7 @@ class GNN(nn.Module):
 
     The levels are the nodes, clusters of nodes, clusters of clusters and so on, down to a complete
     graph of a few clusters. The inputs of a level are the resultant forces and moments on its
-    clusters, the fractions of fixed degrees of freedom and of boundary nodes, and relative
+    clusters, the fractions of free degrees of freedom and of boundary nodes, and relative
     positions. Absolute positions are no input, so the prediction is invariant under translations. A
     pass is a V-cycle over the levels and propagates information through the whole body. Coarser
     levels have more channels.

@@ -28,7 +28,7 @@ class Level(nn.Module):
 
         Args:
             graph: The graph of K members.
-            flags: Fractions of fixed degrees of freedom and boundary nodes, (K, D + 1).
+            flags: Fractions of free degrees of freedom and of boundary nodes, (K, D + 1).
             nodes: Number of nodes of the mesh.
             width: Channels of the state.
             first: Members are the nodes of the mesh.

@@ -3,6 +3,7 @@
 The bases are fitted to the training samples (`fit_bases`) and stored in buffers of the network.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import cast
 
 import torch
@@ -55,8 +56,12 @@ class PODNet(nn.Module):
 
     The bases are those of the training loads and displacements, or with a linear base of linear
     solutions and of what has to be added to them. If the body has symmetries, both bases are
-    invariant under them, and the prediction in evaluation mode is the mean over all images of the
-    load, each transformed back. It then has the symmetries exactly.
+    invariant under them, and the prediction is the mean over all images of the load, each
+    transformed back. It then has the symmetries exactly. Training in coordinates takes the output
+    of the network alone, since `encode` adds the images as samples of their own.
+
+    `torch.autocast` applies to the layers of the network only. Projections to and from the bases
+    keep the precision of their fields.
 
     Source: Hesthaven, Ubbiali (2018), Non-intrusive reduced order modeling of nonlinear problems
     using neural networks, J. Comput. Phys. 363.
@@ -172,8 +177,9 @@ class PODNet(nn.Module):
             parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
             amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
         """
-        encoded = self.encode_loads(self.input_orbits.images(force))
-        inputs = self.append_scalars(encoded @ self.input_map, parameters, amplitude)
+        with _full_precision(force.device.type):
+            encoded = self.encode_loads(self.input_orbits.images(force))
+            inputs = self.append_scalars(encoded @ self.input_map, parameters, amplitude)
         return self.field(self.symmetrised_output(inputs), force)
 
     def encode_loads(self, images: Tensor) -> Tensor:
@@ -191,8 +197,9 @@ class PODNet(nn.Module):
 
     def field(self, coordinates: Tensor, like: Tensor) -> Tensor:
         """Return displacements (B, N, D), shaped like `like`, of coordinates (B, R)."""
-        every = coordinates_of_images(coordinates, self.inverse_output_actions.to(coordinates))
-        return self.output_orbits.field(every @ self.modes.to(coordinates), like)
+        with _full_precision(coordinates.device.type):
+            every = coordinates_of_images(coordinates, self.inverse_output_actions.to(coordinates))
+            return self.output_orbits.field(every @ self.modes.to(coordinates), like)
 
     def coordinates(self, displacement: Tensor) -> Tensor:
         """Return the coordinates (B, R) of displacements (B, N, D)."""
@@ -201,15 +208,14 @@ class PODNet(nn.Module):
         return sum_over_images(projected, self.inverse_output_actions.to(displacement))
 
     def symmetrised_output(self, inputs: Tensor) -> Tensor:
-        """Return coordinates (B, R) of the displacement from inputs (B, M).
-
-        In evaluation mode this is the mean over the images of the load. In training mode it is the
-        output of the network alone, because images are samples of their own.
-        """
-        if self.training or len(self.input_actions) == 1:
+        """Return the mean over the images of the load of the coordinates (B, R), from (B, M)."""
+        if len(self.input_actions) == 1:
             return self.network(inputs)
-        outputs = self.network((inputs @ self.input_actions).movedim(0, 1))
-        return sum_over_images(outputs, self.inverse_output_actions) / len(self.input_actions)
+        with _full_precision(inputs.device.type):
+            images = (inputs @ self.input_actions).movedim(0, 1)
+        outputs = self.network(images)
+        with _full_precision(inputs.device.type):
+            return sum_over_images(outputs, self.inverse_output_actions) / len(self.input_actions)
 
     def network(self, inputs: Tensor) -> Tensor:
         """Return coordinates (..., R) from inputs (..., M), without symmetrisation."""
@@ -334,3 +340,10 @@ class PODNet(nn.Module):
             factor=torch.ones_like(square),
         )
         return ReducedSamples(*(column.cpu() for column in encoded))
+
+
+def _full_precision(device: str) -> AbstractContextManager[object]:
+    """Return a context without `torch.autocast`."""
+    if torch.is_autocast_enabled(device):
+        return torch.autocast(device, enabled=False)
+    return nullcontext()

@@ -8,6 +8,7 @@ tensors and plain data only (`weights_only`).
 """
 
 import json
+import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,8 +25,9 @@ from safetensors.torch import save
 from dpl.system.files import atomic_write
 
 WEIGHTS = ".safetensors"
-# keys of a checkpoint that are stored in the JSON header
-HEADER = ("scene", "identity", "nodes", "epoch", "global_step")
+# keys of a checkpoint that are stored in the JSON header; the last one is the learning curve of a
+# growing data set
+HEADER = ("scene", "identity", "nodes", "epoch", "global_step", "OfflineData")
 # files from which a run is loaded, by priority; a short run has only its last checkpoint
 LOADABLE = (f"best{WEIGHTS}", "best.ckpt", "last.ckpt")
 RESUME_KEYS = {"loops", "callbacks", "optimizer_states", "lr_schedulers"}
@@ -125,18 +127,12 @@ def writes_loadable(callback: Any, trainer: L.Trainer, folder: str | Path) -> bo
     """Return True if a callback writes a checkpoint from which a run's `folder` is loaded."""
     if not isinstance(callback, ModelCheckpoint) or callback.save_top_k == 0:
         return False
-    if callback.monitor is not None and not _validates(trainer):
+    if callback.monitor is not None and trainer.limit_val_batches == 0:
         return False
     target = Path(folder).resolve() / "checkpoints"
     in_target = callback.dirpath is not None and Path(callback.dirpath).resolve() == target
     named = f"{callback.filename}{callback.FILE_EXTENSION}" in LOADABLE or callback.save_last
     return bool(in_target and named and not getattr(trainer, "fast_dev_run", False))
-
-
-def _validates(trainer: L.Trainer) -> bool:
-    """Return True if the training has at least one validation."""
-    every, most = trainer.check_val_every_n_epoch, trainer.max_epochs
-    return trainer.limit_val_batches != 0 and (every is None or most in (None, -1) or every <= most)
 
 
 class BestWeights(ModelCheckpoint):
@@ -152,3 +148,18 @@ class BestWeights(ModelCheckpoint):
         """Return True if an error is finite and smaller than the previous ones."""
         finite = current is None or bool(current.isfinite())
         return finite and super().check_monitor_top_k(trainer, current)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the best errors, also after the folder was moved with its files."""
+        before, here = str(state_dict.get("dirpath")), str(self.dirpath)
+        moved = {key: _rebased(value, before, here) for key, value in state_dict.items()}
+        files = moved.get("best_k_models")
+        is_moved = before != here and files and all(map(os.path.isfile, files))
+        super().load_state_dict(moved if is_moved else state_dict)
+
+
+def _rebased(value: Any, before: str, here: str) -> Any:
+    """Return a path, or a mapping of paths, in another folder; other values unchanged."""
+    if isinstance(value, dict):
+        return {_rebased(path, before, here): error for path, error in value.items()}
+    return value.replace(before, here, 1) if isinstance(value, str) else value

@@ -57,9 +57,39 @@ class _PerLoad(Metric):
 
 
 class _OfProblem(_PerLoad):
+    """Base class of the metrics that one evaluation of the body gives.
+
+    Each of them stores the relative residual and min det F of each load, (B, 2). A compute group of
+    `MetricCollection` therefore evaluates the body once for all of them.
+
+    Attributes:
+        column: Column of the metric.
+    """
+
+    column: int
+
     def __init__(self, problem: Problem, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.problem = problem
+
+    def update(self, prediction: Tensor, batch: Sample) -> None:
+        """Add the numbers of a batch."""
+        self.values.append(self._evaluate(prediction.double(), batch))
+
+    def compute(self) -> Tensor:
+        """Return the metric over all loads, ()."""
+        return self.reduce(dim_zero_cat(self.values)[:, self.column])
+
+    def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
+        """See `_PerLoad`."""
+        return self._evaluate(prediction, batch)[:, self.column]
+
+    def _evaluate(self, prediction: Tensor, batch: Sample) -> Tensor:
+        """Return the relative residual and min det F of each load, (B, 2)."""
+        problem = self.problem.with_parameters(batch.parameters)
+        internal, volume_ratio = problem.evaluate(prediction)
+        residual = problem.relative_residual_of(internal, batch.force)
+        return torch.stack([torch.nan_to_num(residual, nan=torch.inf), volume_ratio], dim=1)
 
 
 class MeanError(_PerLoad):
@@ -119,23 +149,14 @@ class ResidualRatio(_OfProblem):
     """Median over loads of the relative residual ||R_free(u)|| / ||f||."""
 
     reduce = staticmethod(median)
-
-    def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        """See `_PerLoad`."""
-        ratio = self.problem.with_parameters(batch.parameters).relative_residual(
-            prediction, batch.force
-        )
-        return torch.nan_to_num(ratio, nan=torch.inf)
+    column = 0
 
 
 class MinVolumeRatio(_OfProblem):
     """min det F over quadrature points and loads; 0 or less means an inverted element."""
 
     reduce = staticmethod(torch.min)
-
-    def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        """See `_PerLoad`."""
-        return self.problem.volume_ratio(prediction)
+    column = 1
 
 
 def default_metrics(problem: Problem) -> MetricCollection:
@@ -151,7 +172,8 @@ def default_metrics(problem: Problem) -> MetricCollection:
             "residual": ResidualRatio(problem),
             "min_det_F": MinVolumeRatio(problem),
         },
-        compute_groups=False,
+        # in alphabetical order: with another one `forward` loses the numbers of earlier batches
+        compute_groups=[["min_det_F", "residual"]],
     )
 
 

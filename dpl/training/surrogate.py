@@ -304,15 +304,14 @@ class Surrogate(L.LightningModule):
         """Return the loss, which is a callback, and that of a model without gradient descent."""
         return [self.loss, ClosedFormTraining()] if self._is_closed_form else [self.loss]
 
-    def on_train_epoch_start(self) -> None:
-        """Let the last epoch be validated."""
-        if self.current_epoch + 1 == self.trainer.max_epochs:
-            self.trainer.check_val_every_n_epoch = 1
-
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Let the epoch be validated in which a time limit ends the training."""
-        if self.trainer.should_stop:
-            self.trainer.check_val_every_n_epoch = 1
+        """Let the weights be validated with which the training ends."""
+        trainer = self.trainer
+        last = trainer.is_last_batch and self.current_epoch + 1 == trainer.max_epochs
+        if last or trainer.global_step == trainer.max_steps:
+            trainer.should_stop = True  # Lightning then validates after this batch
+        if trainer.should_stop and trainer.check_val_every_n_epoch is not None:
+            trainer.check_val_every_n_epoch = 1
 
     def configure_optimizers(self) -> Any:
         """Return the optimiser with its schedule; None without parameters."""

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from omegaconf import OmegaConf
 
 from dpl.config import run_folder
 from dpl.training import checkpoints
@@ -56,6 +57,15 @@ def test_the_set_of_a_growing_run_serves_a_run_of_given_size(train, tmp_path):
         for run in ("run", "other")
     ]
     assert all(weights[0][name].equal(weights[1][name]) for name in weights[0])
+
+
+def test_the_number_of_loads_of_a_run_is_not_that_of_its_data_set(train, tmp_path):
+    assert not train(*RUN, *MODEL, *SIZES, "data.max_train=20", "data.error=1e-9").status
+    cfg, surrogate = run_folder.load_run(tmp_path / "run")
+    more = OmegaConf.merge(cfg, {"data": {"train": 24}})
+    assert len(run_folder.load_data(more, surrogate.scene).samples("train").force) == 24
+    assert run_folder.training_loads(cfg, surrogate.scene) == 20
+    assert len(run_folder.load_data(cfg, surrogate.scene).snapshots().force) == 20
 
 
 def test_models_trained_by_gradient_descent_are_refused(train):

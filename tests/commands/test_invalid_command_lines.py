@@ -64,6 +64,9 @@ NONSENSE = {  # command line -> what the one line says
     "train -m fixed.axis=0,3": r"^fixed: axis = 3",
     "train -m trainer.accelerator=cpu,foo": r"^trainer: .*foo",
     "generate -m shard=range(4) shards=3": r"^data: shard = 3 must lie between 0 and 2$",
+    "train data=online +data.error=1e-3": r"^data\.error: dpl\.data\.OnlineData has no such option",
+    "generate data._target_=dpl.data.OfflineData": r"^data\._target_ = .*dpl\.data\.DataSet",
+    "train data._target_=dpl.data.DataSet": r"^data\._target_ = .*dpl\.data\.OfflineData",
     "generate actoin=verify": r"^actoin: there is no such key; did you mean action\?$",
     "view rn=3": r"^rn: there is no such key; did you mean run\?$",
     "evaluate": r"^run is missing",
@@ -241,7 +244,7 @@ CALLBACKS = {  # what keeps weights from which a run can be loaded, and what doe
     "callbacks.best_weights.dirpath=x callbacks.last_checkpoint.dirpath=x": False,
     f"{NONE} {OTHER}": False,
     f"{NONE} {LAST}": True,
-    f"{NONE} {BEST}": False,  # no epoch is validated
+    f"{NONE} {BEST}": True,  # the last epoch is validated
     f"{NONE} {BEST} {OFTEN}": True,
     f"{NONE} {BEST} {OFTEN} +trainer.limit_val_batches=0": False,
 }

@@ -250,7 +250,8 @@ def test_images_under_symmetries_are_not_solved(scene, folder, data, calls, monk
     module = OfflineData(scene, folder=str(folder), symmetry=True, **sizes)
     line = module.skipped_work()[-1]
     count = int(line.split()[0])
-    assert line == f"{count} samples of each load solved: symmetries of the body"
+    images = f"{count} samples of each load solved, in gradient descent only"
+    assert line == f"{images}: symmetries of the body"
     monkeypatch.setattr(
         "dpl.data.solving.worker_pool.solve_load", lambda *job: pytest.fail("solved")
     )

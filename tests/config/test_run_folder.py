@@ -187,14 +187,23 @@ BAD_TRAINING = {
     "optimizer.lr=0": r"optimizer\.lr = 0 must lie between 1e-30 and 1000000",
     "optimizer.lr=1e30": r"optimizer\.lr = 1e\+30 must lie",
     "optimizer.lr=-1": r"optimizer\.lr = -1 must lie",
+    "+trainer.enable_progress_bar=false": r"^trainer: .*enable_progress_bar=False.* found .*Bar",
+    "+trainer.enable_checkpointing=false": r"^trainer: .*enable_checkpointing=False.* found",
 }
+if not torch.cuda.is_available():
+    BAD_TRAINING["trainer=gpu"] = r"^trainer: No supported gpu backend found"
 
 
 BAD_COMMANDS = {
     "evaluate run=x tols=[small]": r"tols = \['small'\] must be a list, each a number",
     "evaluate run=x tols=[0]": r"tols = \[0\] must lie between 1e-15 and 1",
     "convergence resume=perhaps": r"resume = 'perhaps' must be true or false",
+    "evaluate run=x tols=[1.0]": r"tols = \[1\.0\] must lie between 1e-15 and 1, 1 excluded",
+    "evaluate run=x tols=[]": r"tols = \[\] must name one value or more",
     "convergence tols=[1e-3,2]": r"tols = \[0\.001, 2\] must lie between",
+    "convergence tols=[1.0]": r"tols = \[1\.0\] must lie between 1e-15 and 1, 1 excluded",
+    "convergence tols=[]": r"tols = \[\] must name one value or more",
+    "pareto run=x threads=[]": r"threads = \[\] must name one value or more",
     "convergence n_far_loads=-1": r"n_far_loads = -1 must lie between 0 and",
     "results name=x count=many": r"count = 'many' must be a whole number",
     "results name=x galerkin=text": r"galerkin = 'text' must be",
@@ -519,6 +528,42 @@ def test_a_run_over_a_range_of_moduli_with_e_as_an_input_comes_back_as_it_was(
     assert answer.isfinite().all()
 
 
+WIDE = ["young={low:1e6,high:2e11,distribution:log}", "model.young=true"]
+
+
+@pytest.fixture(scope="module")
+def several(tiny_training, tmp_path_factory):
+    """A folder of runs of one fingerprint that differ in size or moduli, and their surrogates."""
+    home = tmp_path_factory.mktemp("runs")
+    runs = {
+        "a": ["young=[1e9,2e11]", "model.young=true"],
+        "b": WIDE,
+        "c": ["young=[1e9,2e11]", "model.young=true", "mesh.size=[200.0,50.0,50.0]"],
+        "d": ["young=[1e9,2e11]", "model.young=true"],
+    }
+    kept = {name: _trained(home / name, *tiny_training, *more) for name, more in runs.items()}
+    assert len({surrogate.scene.fingerprint for surrogate in kept.values()}) == 1
+    return home, kept
+
+
+def test_runs_of_other_moduli_or_sizes_come_back_as_they_were(several):
+    home, kept = several
+    loads = kept["b"].scene.loads.sample((0, 2), range(4))
+    force, young = loads.force * 1e9, loads.young
+    found = run_folder.load_runs(home)
+    for name, (_, again) in found.items():
+        with torch.no_grad():
+            assert torch.equal(again(force, young), kept[name](force, young)), name
+    assert found["d"][1].scene is found["a"][1].scene, "one factor for runs of one scene"
+
+
+def test_runs_of_other_scenes_are_refused(several, tiny_training, tmp_path):
+    shutil.copytree(several[0] / "a", tmp_path / "a")
+    _trained(tmp_path / "b", *tiny_training, *WIDE, "material.poisson=0.25")
+    with pytest.raises(ConfigError, match=r"b is of another scene than a: law\.poisson"):
+        run_folder.load_runs(tmp_path)
+
+
 def test_a_run_keeps_its_resolved_configuration(trained):
     text = (trained[0] / "config.yaml").read_text()
     assert "${" not in text
@@ -774,6 +819,18 @@ def test_a_resumed_run_names_only_what_the_command_line_changes(
 ):
     with pytest.raises(ConfigError, match=reported):
         resume.check_resumed(resumed_config(trained[0], override))
+
+
+def test_an_option_of_the_trainer_changes_only_the_machine_of_a_resumed_run(
+    trained, resumed_config
+):
+    cfg = resumed_config(trained[0], "trainer=ddp")
+    assert (cfg.trainer.strategy, cfg.trainer.devices) == ("ddp", 2)
+    assert (cfg.trainer.max_epochs, cfg.trainer.check_val_every_n_epoch) == (1, 1)
+    longer = resumed_config(trained[0], "trainer.max_epochs=7", "trainer=cpu")
+    assert (longer.trainer.accelerator, longer.trainer.max_epochs) == ("cpu", 7)
+    build.check(longer)
+    assert resume.check_resumed(longer)["epoch"] == 0
 
 
 def test_a_resumed_run_calls_only_trusted_objects_or_those_of_the_command_line(

@@ -260,7 +260,7 @@ def test_images_of_a_sample_are_spread_over_the_epoch(offline):
 
 def test_the_plan_says_how_many_samples_a_load_makes(scene, offline):
     count = len(symmetries(scene.problem))
-    line = f"{count} samples of each load solved: symmetries of the body"
+    line = f"{count} samples of each load solved, in gradient descent only: symmetries of the body"
     assert line in offline(symmetry=True).skipped_work()
     assert not any("symmetr" in line for line in offline().skipped_work())
 
@@ -348,6 +348,35 @@ def test_resumed_streams_of_two_processes_draw_no_load_twice(scene, online):
 def test_options_of_the_stream_out_of_range_are_refused_by_name(online, options):
     with pytest.raises(ValueError, match=f"{next(iter(options))} = "):
         online(**options)
+
+
+def test_a_buffer_whose_uses_make_no_batch_is_refused(online):
+    """Loads would be solved without end."""
+    with pytest.raises(ValueError, match=r"reuse = 8 .* batch_size = 17") as refusal:
+        online(capacity=8, reuse=2, batch_size=17)
+    assert "\n" not in str(refusal.value)
+    options = {"capacity": 8, "reuse": 2, "batch_size": 16, "new_per_round": 3, "batches": 2}
+    assert len(list(online(**options).train_dataloader())) == 2
+
+
+@pytest.mark.parametrize("option", ["train", "error", "minutes", "max_train"])
+def test_options_without_effect_on_a_stream_are_refused(online, option):
+    with pytest.raises(TypeError, match=option):
+        online(**{option: 1})
+
+
+def test_batches_of_a_stream_are_a_function_of_shuffle(online):
+    options = {"symmetry": True, "reuse": 2}
+    first, same, other = (
+        forces(online(shuffle_seed=seed, **options).train_dataloader()) for seed in (3, 3, 4)
+    )
+    assert first == same != other
+
+
+@pytest.mark.parametrize("name", ["online", "offline"])
+def test_the_order_of_the_batches_follows_the_seed_of_the_run(compose, name):
+    cfg = compose(f"data={name}", "seed=5", command="train")
+    assert (cfg.data.shuffle_seed, cfg.data.seed) == (5, 0)
 
 
 def test_the_cache_and_hard_examples_exclude_each_other(online):

@@ -311,6 +311,17 @@ def test_two_streams_give_the_same_batches(replay):
         assert torch.equal(a.young, b.young)
 
 
+def test_batches_are_a_function_of_the_seed(replay):
+    """The samples are the same; their order is not."""
+
+    def order(seed):
+        stream = replay(seed=seed, reuse=1, new_per_round=8)
+        return [place for batch in stream for place in places(batch)]
+
+    assert order(1) == order(1) != order(2)
+    assert sorted(order(1)) == sorted(order(2))
+
+
 @pytest.mark.slow
 def test_batches_do_not_depend_on_which_worker_is_faster(replay):
     streams = [replay(Numbers(pause=pause), workers=2) for pause in ([0.02, 0.0], [0.0, 0.02])]
@@ -738,13 +749,32 @@ def test_a_replaced_worker_solves_loads_of_its_own_rank(replay):
     assert [place % 2 for place in seen] == [0] * 12
 
 
-def test_an_error_of_the_stream_itself_is_raised(replay):
-    class Faulty(Numbers):
-        def drawn(self, place):
-            raise RuntimeError("a fault of ours")
+class Faulty(Numbers):
+    """A stream each of whose loads raises an error.
 
-    with pytest.raises(RuntimeError, match="a fault of ours"):
-        next(iter(replay(Faulty())))
+    Attributes:
+        error: The error.
+    """
+
+    def __init__(self, error):
+        super().__init__()
+        self.error = error
+
+    def drawn(self, place):
+        raise self.error
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("error", [RuntimeError, OSError])
+def test_an_error_of_the_stream_itself_is_raised_at_once(replay, workers, error, monkeypatch):
+    """Workers report it, so that they are not dead."""
+    stream, started = replay(Faulty(error("a fault of ours")), workers=workers), []
+    start = stream._start
+    monkeypatch.setattr(stream, "_start", lambda: started.append(1) or start())
+    with pytest.raises(error, match="a fault of ours"):
+        next(iter(stream))
+    assert len(started) == 1
+    assert stream.stream.offsets == {}, "no load is skipped"
 
 
 def test_a_closed_stream_can_be_closed_again(replay):

@@ -2,6 +2,8 @@
 
 import csv
 import math
+import os
+import time
 from dataclasses import replace
 from itertools import pairwise
 
@@ -9,6 +11,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from dpl.commands import convergence
 from dpl.evaluation import newton_figure, newton_starts
 from dpl.evaluation.newton_starts import (
     Trial,
@@ -258,6 +261,66 @@ def test_lines_are_labelled_and_labels_do_not_overlap(monkeypatch, tmp_path):
         assert len(ax.lines) == 4
         for line in ax.lines:
             assert list(line.get_ydata()) == [0, 25, 50, 75, 75]
+
+
+@pytest.fixture
+def resumed(compose, scene, monkeypatch):
+    """Measures tasks as the command does; returns trials, and sets of loads that were measured."""
+    measured = []
+
+    def counted(solvers, name, *rest, **options):
+        measured.append(name)
+        return measure(solvers, name, *rest, **options)
+
+    monkeypatch.setattr(newton_starts, "measure", counted)
+
+    def resumed(*overrides, networks=()):
+        measured.clear()
+        few = ["run=e", "tols=[1e-3,1e-6]", "count=2", "n_far_loads=1", "twice=false"]
+        cfg = compose(*few, "solvers=[plain Newton]", *overrides, command="convergence")
+        return convergence.measure(cfg, scene, dict(networks)), list(measured)
+
+    return resumed
+
+
+def test_only_measurements_with_the_same_options_are_reused(resumed):
+    near, far = ["in range"] * 2, ["3 times", "5 times"]
+    first, measured = resumed()
+    assert measured == near + far
+    assert len(first) == 2 * (2 * 2 + 2)
+    assert resumed()[1] == []
+    stopped, measured = resumed("step_tol=1e3")
+    assert measured == near + far
+    assert {t.iterations for t in stopped if t.solver == "plain Newton"} == {1}
+    assert resumed("max_far_iterations=7")[1] == far
+    again, measured = resumed()
+    assert measured == []
+    assert [replace(t, ms=0, deviation=0) for t in again] == [
+        replace(t, ms=0, deviation=0) for t in first
+    ]
+
+
+def test_tolerances_that_are_not_requested_are_left_out_and_kept_in_the_file(resumed):
+    resumed("n_far_loads=0")
+    one, measured = resumed("n_far_loads=0", "tols=[1e-6]")
+    assert measured == []
+    assert {trial.tol for trial in one} == {1e-6}
+    assert resumed("n_far_loads=0", "tols=[1e-6,1e-6,1e-4]")[1] == ["in range"]
+    both, measured = resumed("n_far_loads=0")
+    assert measured == []
+    assert len(summary(both)) == 2 * 2
+
+
+def test_measurements_older_than_a_network_in_the_file_are_repeated(resumed, networks, tmp_path):
+    near = {"near": networks["near"]}
+    hybrid = 'solvers=[plain Newton,"hybrid, paper\'s rule"]'
+    assert len(resumed(hybrid, networks=near)[1]) == 4
+    weights = tmp_path / "e" / "near" / "checkpoints" / "best.safetensors"
+    weights.parent.mkdir(parents=True)
+    weights.touch()
+    os.utime(weights, (time.time() + 100,) * 2)
+    assert len(resumed("tols=[1e-3]", "n_far_loads=0")[1]) == 1
+    assert {trial.network for trial in read(Trial, tmp_path / "e" / "hybrid_newton.csv")} == {""}
 
 
 def test_the_script_measures_the_runs_of_a_folder_and_resumes(script, tiny_training, tmp_path):

@@ -103,3 +103,40 @@ def test_the_script_measures_the_runs_of_a_folder(script, tiny_training, tmp_pat
     assert refused.status == 2
     assert refused.err.startswith("error: discretisation: ")
     assert refused.err.count("\n") == 1
+    refused = script("pareto", "run=runs/e", cwd=tmp_path)
+    assert refused.status == 2
+    assert refused.err.startswith("error: galerkin: rank = 100 must lie between 1 and 16, ")
+    assert refused.err.endswith("; galerkin=null leaves it out\n")
+    assert refused.err.count("\n") == 1
+
+
+def test_a_law_with_a_range_is_measured_without_pod_galerkin(script, tiny_training, tmp_path):
+    kept = [one for one in tiny_training if not one.startswith(("model.", "data.train"))]
+    law = ["model=unrolled", "material.poisson=[0.2,0.4]", "data.train=40", "run=runs/e/a"]
+    ended = script("train", *kept, *law, cwd=tmp_path)
+    assert ended.status == 0, ended.err[-2000:]
+    refused = script("pareto", "run=runs/e", cwd=tmp_path)
+    assert refused.status == 2
+    assert refused.err.startswith("error: galerkin: poisson = [0.2, 0.4] must be one number")
+    assert refused.err.count("\n") == 1
+    ended = script("pareto", "run=runs/e", "galerkin=null", cwd=tmp_path)
+    assert ended.status == 0, ended.err[-2000:]
+    path = tmp_path / "runs" / "pareto" / "pareto_e.csv"
+    error = {row["solver"]: float(row["error"]) for row in csv.DictReader(path.open())}
+    assert error["a, corrected"] < error["a"] < error["linear"]
+
+
+def test_reduced_models_of_a_run_on_a_stream_are_made_from_its_validation_loads(
+    script, tiny_training, tmp_path
+):
+    kept = [one for one in tiny_training if not one.startswith("data.train")]
+    stream = ["data=online", "data.batches=1", "data.capacity=8", "trainer.max_epochs=1"]
+    ended = script("train", *stream, *kept, "run=runs/e/a", cwd=tmp_path)
+    assert ended.status == 0, ended.err[-2000:]
+    ended = script("pareto", "run=runs/e", "galerkin.rank=4", cwd=tmp_path)
+    assert ended.status == 0, ended.err[-2000:]
+    path = tmp_path / "runs" / "pareto" / "pareto_e.csv"
+    assert "POD-Galerkin" in {row["solver"] for row in csv.DictReader(path.open())}
+    refused = script("pareto", "run=runs/e", "galerkin.rank=5", cwd=tmp_path)
+    assert refused.status == 2
+    assert "galerkin: rank = 5 must lie between 1 and 4, " in refused.err

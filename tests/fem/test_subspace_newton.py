@@ -168,6 +168,25 @@ def by_products(body: Problem, white: Tensor) -> Tensor:
 # ------------------------------------------------------------------ steps
 
 
+def test_a_correction_uses_the_parameters_of_its_load():
+    """In the whole space it ends at the solution of the body with these parameters."""
+    problem = Problem.build(
+        box([2.0, 1.0, 1.0], [3, 2, 2]), NeoHookeanLn((0.1, 0.4)), fixed=Plane(0, "min")
+    )
+    vectors = torch.zeros(*problem.shape, int(problem.free.sum()), dtype=torch.float64)
+    vectors[problem.free] = torch.eye(vectors.shape[2], dtype=torch.float64)
+    force, zero = 2e-3 * problem.free * noise(*problem.shape), torch.zeros_like(vectors[..., 0])
+    solver = SubspaceNewton(problem, vectors, error_tol=1e-7, max_iter=10)
+    for poisson in (0.15, 0.35):
+        values = torch.tensor([poisson], dtype=torch.float64)
+        found = solver.correct(force, zero, parameters=values)
+        body = problem.with_parameters(values[None])
+        exact = solve(Newton(body, linear="superlu"), Load(force[None], torch.ones(1).double()))
+        assert errors(found[None], exact.displacement).max() < 1e-6
+    with pytest.raises(ValueError, match="has 0 parameters"):
+        solver.correct(force, zero)
+
+
 def test_limit_is_the_equilibrium_in_the_subspace(newton, solver, vectors, unseen):
     exact = PODGalerkin(newton.problem, vectors, reduced_tol=1e-10)
     projected = torch.stack([exact.reduced(force).displacement for force in unseen.force])

@@ -1,5 +1,6 @@
 """Checkpoints are written atomically, read unchanged, and executed never."""
 
+import contextlib
 import io
 import json
 import os
@@ -147,6 +148,25 @@ def test_an_error_that_is_not_finite_is_never_the_best(tmp_path):
     trainer = L.Trainer(logger=False, callbacks=[best], accelerator="cpu")
     requested = [best.check_monitor_top_k(trainer, torch.tensor(e)) for e in (nan, inf, -inf, 0.5)]
     assert requested == [False, False, False, True]
+
+
+@pytest.mark.parametrize("with_files", [True, False])
+def test_a_moved_folder_keeps_the_best_error_with_its_files(tmp_path, with_files):
+    folders = [tmp_path / "before", tmp_path / "here"]
+    before, here = (
+        BestWeights(dirpath=folder, filename="best", monitor="val/e_mean") for folder in folders
+    )
+    path, best = (str(folder / "best.safetensors") for folder in folders)
+    error = torch.tensor(0.5)
+    before.best_model_path = before.kth_best_model_path = path
+    before.best_model_score = before.kth_value = error
+    before.best_k_models = {path: error}
+    write(CHECKPOINT, folders[with_files] / "best.safetensors")
+    with contextlib.nullcontext() if with_files else pytest.warns(UserWarning, match="dirpath"):
+        here.load_state_dict(before.state_dict())
+    trainer = L.Trainer(logger=False, callbacks=[here], accelerator="cpu")
+    assert here.check_monitor_top_k(trainer, torch.tensor(0.6)) is not with_files
+    assert here.best_k_models == ({best: error} if with_files else {})
 
 
 @pytest.mark.parametrize("what", [[], {"state_dict": 1}, {"weights": {}}])

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import shlex
+import signal
 import time
 
 import lightning as L
@@ -11,7 +13,7 @@ from lightning.pytorch.callbacks import Timer
 
 from dpl.models import FCNN
 from dpl.training import MSE, AveragedWeights, Surrogate, schedules, warmup_cosine
-from dpl.training.checkpoints import read
+from dpl.training.checkpoints import read, write
 
 QUIET = ["callbacks.progress_bar._target_=lightning.pytorch.callbacks.TQDMProgressBar"]
 
@@ -189,6 +191,91 @@ def test_callbacks_of_gradient_descent_leave_a_fitted_model_alone(train, home, c
     names = f"fit-{callbacks}", f"fit-without-{callbacks}"
     one, other = (checkpoint(home, name) for name in names)
     assert digest(one["state_dict"]) == digest(other["state_dict"])
+
+
+# ------------------------------------------------------------------ end and continuation
+
+
+@pytest.mark.parametrize(
+    ("options", "validations"),
+    [
+        ({"max_steps": 8, "check_val_every_n_epoch": 5}, 1),
+        ({"max_steps": 8, "check_val_every_n_epoch": 1}, 3),
+        ({"max_steps": 11, "check_val_every_n_epoch": None, "val_check_interval": 4}, 3),
+        ({"max_epochs": 3, "check_val_every_n_epoch": None, "val_check_interval": 4}, 3),
+        ({"max_epochs": 2, "val_check_interval": 2}, 3),
+        ({"max_epochs": 3, "check_val_every_n_epoch": 2}, 2),
+    ],
+)
+def test_the_last_weights_are_validated(scene, data, tmp_path, options, validations):
+    """Three steps an epoch: epochs, intervals and the last step end together or apart."""
+    record = fit(scene, data, tmp_path, **options)[2]
+    assert len(record.validated) == validations
+    assert torch.equal(record.validated[-1], record.weights[-1])
+
+
+@pytest.mark.parametrize("often", [["5"], ["null", "+trainer.val_check_interval=100"]])
+def test_the_weights_of_the_last_step_are_evaluated(train, home, often):
+    every, *interval = often
+    often = [f"trainer.check_val_every_n_epoch={every}", *interval]
+    train(f"steps-{every}", *often, "+trainer.max_steps=5")
+    assert checkpoint(home, f"steps-{every}", "best.safetensors")["global_step"] == 5
+
+
+def test_a_fitted_model_needs_no_end_of_the_schedule(train, home):
+    model = ["model=unrolled", "data.train=16"]
+    train("endless", "trainer.max_epochs=-1", model=model)
+    assert validation_errors(home, "endless")["e_mean"] > 0
+
+
+INTERRUPTING = """
+import lightning as L
+
+
+class Interrupt(L.Callback):
+    '''Ctrl-C in the second epoch.'''
+
+    def on_train_epoch_start(self, trainer, module):
+        if trainer.current_epoch == 1:
+            raise KeyboardInterrupt
+"""
+
+
+def test_the_printed_command_resumes_the_callbacks_and_the_logger(train, script, home, monkeypatch):
+    (home / "interrupting.py").write_text(INTERRUPTING)
+    monkeypatch.syspath_prepend(str(home))
+    handler = signal.getsignal(signal.SIGINT)
+    stop = "+callbacks.stop={_target_: interrupting.Interrupt}"
+    try:
+        ended = train("torn", *EMA, "logger=csv", stop, "trainer.max_epochs=3", status=130)
+    finally:
+        signal.signal(signal.SIGINT, handler)  # Lightning ignores it after the first Ctrl-C
+    line = next(one for one in ended.err.splitlines() if one.startswith("to resume: "))
+    words = shlex.split(line)[-7:]
+    assert words[:2] == ["run=torn", "ckpt_path=last"]
+    assert set(words[2:]) == {*EMA, *QUIET, "logger=csv", stop}
+    again = script("train", *(one for one in words if one != stop), cwd=home)
+    assert again.status == 0, again.err
+    assert (home / "torn" / "csv" / "metrics.csv").is_file()
+    assert checkpoint(home, "torn")["callbacks"]["AveragedWeights"]["steps"] == 6
+
+
+def test_a_moved_run_keeps_its_best_weights(train, home):
+    train("here", "trainer.max_epochs=2")
+    (home / "here").rename(home / "there")
+    path = home / "there" / "checkpoints" / "last.ckpt"
+    found, best = read(path), torch.tensor(1e-12)
+    key = next(key for key in found["callbacks"] if key.startswith("BestWeights"))
+    state = found["callbacks"][key]
+    own = dict.fromkeys(state["best_k_models"], best)
+    state |= {"best_model_score": best, "kth_value": best, "best_k_models": own}
+    write(found, path)
+    before = checkpoint(home, "there", "best.safetensors")
+    train("there", "trainer.max_epochs=3", "ckpt_path=last")
+    assert checkpoint(home, "there")["epoch"] == 2
+    assert checkpoint(home, "there", "best.safetensors")["epoch"] == before["epoch"]
+    train("new", "trainer.max_epochs=4", f"ckpt_path={path}")
+    assert checkpoint(home, "new", "best.safetensors")["epoch"] == 3, "the old ones are not there"
 
 
 # ------------------------------------------------------------------ time limits

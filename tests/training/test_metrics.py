@@ -74,6 +74,34 @@ def test_batches_accumulate_to_the_same_as_one(scene, prediction, batch):
     )
 
 
+def test_batches_accumulate_in_the_forward_method(scene, prediction, batch):
+    """A collection that is called returns the metrics of the batch and accumulates them."""
+    found, whole = default_metrics(scene.problem), default_metrics(scene.problem)
+    whole.update(prediction, batch)
+    for start, end in ((0, 5), (5, 6), (6, 12)):
+        rows = prediction[start:end], Sample(*(column[start:end] for column in batch))
+        one = default_metrics(scene.problem)
+        one.update(*rows)
+        assert found(*rows) == one.compute()
+    assert {k: float(v) for k, v in found.compute().items()} == pytest.approx(
+        {k: float(v) for k, v in whole.compute().items()}, rel=1e-12
+    )
+
+
+def test_the_body_is_evaluated_once_per_batch(scene, prediction, batch, monkeypatch):
+    calls, evaluate = [], Problem.evaluate
+    monkeypatch.setattr(
+        Problem, "evaluate", lambda *arguments: calls.append(1) or evaluate(*arguments)
+    )
+    monkeypatch.setattr(Problem, "volume_ratio", None)
+    found = default_metrics(scene.problem).clone(prefix="val/")
+    for count in (1, 2, 3):
+        found.update(prediction, batch)
+        assert len(calls) == count
+    found.compute()
+    assert len(calls) == 3
+
+
 def test_metrics_forget_on_reset(scene, prediction, batch):
     found = default_metrics(scene.problem)
     found.update(batch.displacement + 1.0, batch)

@@ -220,15 +220,25 @@ class SubspaceNewton:
         if best is not state:
             yield best._replace(iterations=state.iterations)
 
-    def correct(self, force: Tensor, guess: Tensor, *, steps: int | None = None) -> Tensor:
+    def correct(
+        self,
+        force: Tensor,
+        guess: Tensor,
+        *,
+        parameters: Tensor | None = None,
+        steps: int | None = None,
+    ) -> Tensor:
         """Return the last displacement (N, D) of `states` from a guess (N, D).
 
         Args:
             force: Nodal force, (N, D) [-].
             guess: Displacement, (N, D) [-].
+            parameters: Values of `Problem.parameter_ranges`, (P,); may be left out if there are
+                none.
             steps: Largest number of steps; None: `max_iter`.
         """
-        load = Load(force[None], torch.ones(1, dtype=torch.float64))
+        values = None if parameters is None else parameters[None]
+        load = Load(force[None], torch.ones(1, dtype=torch.float64), values)
         *_, last = self.states(load, guess=guess[None], max_iter=steps)
         return last.displacement[0]
 
