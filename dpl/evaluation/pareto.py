@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.text import Annotation
-    from matplotlib.transforms import Bbox
 
 Cells = tuple[int, ...]
 WORDS = {
@@ -30,6 +29,7 @@ WORDS = {
     "hybrid": "hybrid: each iterate",
 }
 MARKERS = {"corrected": "D", "hybrid": "s", "GPU": "*"}  # of methods; "o" for others
+MARKER_SIZE, LABEL_OFFSET = 7.0, 7.0  # of predictions and their labels [points]
 LEAST = 1e-12  # errors below are drawn there [-]
 
 
@@ -205,12 +205,12 @@ def _draw_methods(ax: "Axes", rows: Sequence[Point]) -> list["Annotation"]:
             method = shown[-1].solver.partition(", ")[2]
             x, y = [row.ms for row in shown], [max(row.error, LEAST) for row in shown]
             ax.loglog(x, y, color=colour, lw=1.2, ms=3, marker=MARKERS.get(method, "o"))
-            ax.loglog(x[-1:], y[-1:], color=colour, ms=7, marker=MARKERS.get(method, "o"))
+            ax.loglog(x[-1:], y[-1:], color=colour, ms=MARKER_SIZE, marker=MARKERS.get(method, "o"))
             ends.append((x[0], y[0]))
         if ends:
             label = ax.annotate(
                 family, min(ends), color=colour, weight="bold", ha="center", va="bottom",
-                xytext=(0, 7), textcoords="offset points", fontsize=8.5,
+                xytext=(0, LABEL_OFFSET), textcoords="offset points", fontsize=8.5,
                 path_effects=[withStroke(linewidth=3, foreground="white")],
             )  # fmt: skip
             labels.append(label)
@@ -224,14 +224,23 @@ def _draw_methods(ax: "Axes", rows: Sequence[Point]) -> list["Annotation"]:
 
 
 def _separate(figure: "Figure", labels: Sequence["Annotation"]) -> None:
-    """Raise labels of points until none overlaps another one, from the lowest to the highest."""
+    """Place labels where none overlaps another one or a point, from the lowest to the highest.
+
+    A label stands above or below its point, or else higher than that.
+    """
+    from matplotlib.transforms import Bbox
+
     figure.draw_without_rendering()
-    placed: list[Bbox] = []
+    half = MARKER_SIZE / 144 * figure.dpi
+    spots = [figure.axes[0].transData.transform(label.xy) for label in labels]
+    taken = [Bbox([spot - half, spot + half]) for spot in spots]
     for label in sorted(labels, key=lambda label: label.get_window_extent().y0):
-        while any(label.get_window_extent().overlaps(other) for other in placed):
-            x, y = label.get_position()
-            label.set_position((x, y + 2))
-        placed.append(label.get_window_extent())
+        height = label.get_window_extent().height * 72 / figure.dpi
+        for offset in (LABEL_OFFSET, -LABEL_OFFSET - height, *range(9, 60, 2)):
+            label.set_position((0, offset))
+            if not any(label.get_window_extent().overlaps(other) for other in taken):
+                break
+        taken.append(label.get_window_extent())
 
 
 def _family(name: str) -> str:
