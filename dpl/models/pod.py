@@ -343,7 +343,7 @@ class PODNet(nn.Module):
 
 
 def _full_precision(device: str) -> AbstractContextManager[object]:
-    """Return a context without `torch.autocast`."""
-    if torch.is_autocast_enabled(device):
+    """Return a context without `torch.autocast`, on devices that know it."""
+    if torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device):
         return torch.autocast(device, enabled=False)
     return nullcontext()
