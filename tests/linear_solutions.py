@@ -20,7 +20,8 @@ def exact(scene, force, own):
         body = scene.problem.with_parameters(values[None])
         moved = body.tangent_product(torch.zeros_like(one)[None], body.prescribed[None])[0]
         solver = scene.linear.with_parameters(values[None])
-        fields.append(solver.solve(torch.where(body.free, one - moved, 0.0)) + body.prescribed)
+        loaded = torch.where(body.free, one - moved - body.force_at_rest, 0.0)
+        fields.append(solver.solve_force(loaded) + body.prescribed)
     return torch.stack(fields)
 
 

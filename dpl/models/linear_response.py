@@ -1,6 +1,5 @@
 """The linear solution K(0)^-1 f of every load, by nested static condensation."""
 
-from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from typing import NamedTuple
 
@@ -28,6 +27,7 @@ from dpl.fem.solvers.condensed_layers import CondensedLayers
 from dpl.fem.solvers.parity_factor import OrbitForm
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import Symmetry
+from dpl.models.precision import full_precision
 from dpl.scene import Scene
 
 MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are float32 [-]
@@ -139,7 +139,7 @@ class LinearResponse:
             parameters: Parameters of the law, (B, P).
         """
         count = max(1, MAX_VALUES // (self.blocks.fronts.unknowns.size * len(self.blocks.values)))
-        with _full_precision(loaded.device.type):
+        with full_precision(loaded.device.type):
             if torch.compiler.is_compiling() or loaded.shape[0] <= count:
                 return self._solve(loaded, parameters)
             both = zip(loaded.split(count), parameters.split(count), strict=True)
@@ -214,13 +214,6 @@ class _Tensors(NamedTuple):
     characters: Tensor
     places: Tensor
     supports: Tensor | None
-
-
-def _full_precision(device: str) -> AbstractContextManager[object]:
-    """Return a context without reduced precision of products."""
-    if torch.is_autocast_enabled(device):
-        return torch.autocast(device, enabled=False)
-    return nullcontext()
 
 
 def _difference(blocks: Condensed, exact: Condensed) -> float:

@@ -3,7 +3,6 @@
 The bases are fitted to the training samples (`fit_bases`) and stored in buffers of the network.
 """
 
-from contextlib import AbstractContextManager, nullcontext
 from typing import cast
 
 import torch
@@ -18,6 +17,7 @@ from dpl.models.invariant_basis import (
     scatter_fields,
 )
 from dpl.models.linear_base import Base
+from dpl.models.precision import full_precision
 from dpl.models.reduced_samples import (
     ReducedDataset,
     ReducedSamples,
@@ -177,7 +177,7 @@ class PODNet(nn.Module):
             parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
             amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
         """
-        with _full_precision(force.device.type):
+        with full_precision(force.device.type):
             encoded = self.encode_loads(self.input_orbits.images(force))
             inputs = self.append_scalars(encoded @ self.input_map, parameters, amplitude)
         return self.field(self.symmetrised_output(inputs), force)
@@ -197,7 +197,7 @@ class PODNet(nn.Module):
 
     def field(self, coordinates: Tensor, like: Tensor) -> Tensor:
         """Return displacements (B, N, D), shaped like `like`, of coordinates (B, R)."""
-        with _full_precision(coordinates.device.type):
+        with full_precision(coordinates.device.type):
             every = coordinates_of_images(coordinates, self.inverse_output_actions.to(coordinates))
             return self.output_orbits.field(every @ self.modes.to(coordinates), like)
 
@@ -211,10 +211,10 @@ class PODNet(nn.Module):
         """Return the mean over the images of the load of the coordinates (B, R), from (B, M)."""
         if len(self.input_actions) == 1:
             return self.network(inputs)
-        with _full_precision(inputs.device.type):
+        with full_precision(inputs.device.type):
             images = (inputs @ self.input_actions).movedim(0, 1)
         outputs = self.network(images)
-        with _full_precision(inputs.device.type):
+        with full_precision(inputs.device.type):
             return sum_over_images(outputs, self.inverse_output_actions) / len(self.input_actions)
 
     def network(self, inputs: Tensor) -> Tensor:
@@ -340,10 +340,3 @@ class PODNet(nn.Module):
             factor=torch.ones_like(square),
         )
         return ReducedSamples(*(column.cpu() for column in encoded))
-
-
-def _full_precision(device: str) -> AbstractContextManager[object]:
-    """Return a context without `torch.autocast`, on devices that know it."""
-    if torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device):
-        return torch.autocast(device, enabled=False)
-    return nullcontext()

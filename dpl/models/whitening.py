@@ -1,11 +1,9 @@
 """Whitening: inputs of networks whose rare parts are not drowned by the frequent ones."""
 
-from contextlib import AbstractContextManager, nullcontext
-
-import torch
 from torch import Tensor
 
 from dpl.fem.rom.pod import pod
+from dpl.models.precision import full_precision
 
 MODES = 128  # of a field that are whitened
 
@@ -63,14 +61,7 @@ class FieldWhitening:
             modes, factors = next(iter(self._on_device.values()))
             self._on_device[field.device] = modes.to(field.device), factors.to(field.device)
         modes, factors = (part.to(field.dtype) for part in self._on_device[field.device])
-        with _full_precision(field.device):  # rounding errors would be amplified
+        with full_precision(field.device.type):  # rounding errors would be amplified
             coordinates = field.flatten(1) @ modes.T
             amplified = (coordinates * (factors - factors[-1])) @ modes
         return factors[-1] * field + amplified.view_as(field)
-
-
-def _full_precision(device: torch.device) -> AbstractContextManager[object]:
-    """Return a context without `torch.autocast`, on devices that know it."""
-    if not torch.amp.is_autocast_available(device.type):
-        return nullcontext()
-    return torch.autocast(device.type, enabled=False)
