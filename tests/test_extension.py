@@ -98,14 +98,14 @@ class ModifiedNewton:
         return fem.LinearSolver(self.problem, self.tol, "superlu")
 
     def iterate(self, load):
-        u = torch.zeros_like(load.force)
+        u = self.problem.prescribed.expand_as(load.force)
         for k in range(self.max_iter):
             state = fem.evaluate_solution(self.problem, u, load, self.tol, iterations=k)
             yield state
             if state.converged.all():
                 return
             residual = load.force - self.problem.evaluate(u).internal
-            u = u + torch.stack([self.linear_solver.solve(r) for r in residual])
+            u = u + torch.stack([self.linear_solver.solve_force(r) for r in residual])
 
     def identity(self):
         return {"name": "ModifiedNewton", "tol": self.tol}

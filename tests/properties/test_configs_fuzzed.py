@@ -348,14 +348,15 @@ def _names() -> list[str]:
 NAMES = _names()
 
 KINDS = {
-    *("Mesh", "Material", "Newton", "ModalLoads", "DataSet", "OfflineData", "Module", "Optimizer"),
+    *("Mesh", "Material", "Newton", "LoadFamily", "DataSet", "OfflineData", "Module", "Optimizer"),
     *("LRScheduler", "Plane", "Box", "Sphere", "Cylinder", "Tag", "DirichletBC", "RobinBC"),
-    *("Traction", "BodyForce", "Loss"),
+    *("Traction", "BodyForce", "FollowerPressure", "ActiveStress", "Loss"),
+    *("CellField", "FibreEnergy", "FibreDirections", "ReferenceSolver"),
 }
 WATCHING = {"Trainer", "Callback", "Logger", "CheckpointIO"}
 FUNCTIONS = {  # they compute a mesh, an array or a schedule and have no other effect
     *("box", "rectangle", "propeller", "read_mesh", "load_mesh", "check_mesh", "warmup_cosine"),
-    *("facets_in", "nodes_in", "conjugate_gradients"),
+    *("facets_in", "nodes_in", "cells_in", "conjugate_gradients"),
     *("symmetric_uniform", "normal", "uniform01", "constant", "logarithmic", "log_tail_mixture"),
 }
 
