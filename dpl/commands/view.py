@@ -77,12 +77,8 @@ def load_body(cfg: DictConfig) -> "viewer.Body":
     import torch
 
     torch.set_num_threads(1)
-    try:
+    with config.error_in("galerkin_correction"):
         return viewer.Body(dpl.load(cfg.run, trust=cfg.trust, corrected=cfg.galerkin_correction))
-    except (config.ConfigError, dpl.DataSetError):  # their messages name the place
-        raise
-    except ValueError as error:
-        raise config.ConfigError(f"galerkin_correction: {error}") from error
 
 
 def bind(cfg: DictConfig) -> "viewer.AccessPolicy":

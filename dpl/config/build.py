@@ -31,6 +31,7 @@ from dpl.fem.assembly.follower_loads import FollowerLoad
 from dpl.fem.units import Units
 from dpl.scene import Scene
 from dpl.system.blas import slow_blas
+from dpl.system.files import DataSetError
 
 if typing.TYPE_CHECKING:
     import lightning as L
@@ -54,11 +55,14 @@ CANNOT_BE_MADE = (  # errors of a call with invalid arguments
 
 @contextlib.contextmanager
 def error_in(key: str, *kinds: type[Exception]) -> Iterator[None]:
-    """Turn a ValueError, or errors of these kinds, into a `ConfigError` that names a key."""
+    """Turn a ValueError, or errors of these kinds, into a `ConfigError` that names a key.
+
+    A `ConfigError` and a `DataSetError` remain what they are: their messages name the place.
+    """
     kinds = kinds or (ValueError,)
     try:
         yield
-    except ConfigError:
+    except (ConfigError, DataSetError):
         raise
     except kinds as error:
         raise ConfigError(f"{key}: {error}") from error

@@ -34,9 +34,6 @@ from dpl.system.memory import at_most
 
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
 MAX_BYTES = 100_000  # of the configuration of a run
-CANNOT_BE_READ = (  # errors of a checkpoint that is damaged or of another run
-    *(OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError),
-)
 
 
 def has_mesh_file(cfg: DictConfig) -> bool:
@@ -126,7 +123,7 @@ def load_run(
 def _usable(checkpoint: Path) -> Iterator[None]:
     try:
         yield
-    except CANNOT_BE_READ as error:
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(f"{checkpoint} cannot be used: {reason}") from error
 
@@ -194,9 +191,9 @@ def load(
 def load_runs(
     folder: str | Path, names: Sequence[str] | None = None, *, trust: bool = False
 ) -> dict[str, tuple[DictConfig, "training.Surrogate"]]:
-    """Return the configurations and surrogates of named runs in a folder, or of all, on one scene.
+    """Return the configurations and surrogates of named runs in a folder, or of all.
 
-    Sizes and ranges of Young's moduli may differ; a run that differs in them has its own scene.
+    They share one scene, except runs of another size or range of Young's moduli.
 
     Raises:
         ConfigError: There are none, or one cannot be used or belongs to another scene.

@@ -50,8 +50,8 @@ class PlainNewton:
 
         Each state has the prescribed displacements of the supports.
         """
-        free, starts = self.problem.free, torch.zeros_like(load.force) if guess is None else guess
-        starts = torch.where(free, starts, self.problem.prescribed)
+        starts = torch.zeros_like(load.force) if guess is None else guess
+        starts = torch.where(self.problem.free, starts, self.problem.prescribed)
         pairs = zip(load.unbatch(), starts, strict=True)
         return run_lockstep([self._member(one, u[None], guess is not None) for one, u in pairs])
 

@@ -4,16 +4,8 @@ import pytest
 import torch
 
 import dpl
-from dpl import Scene
 from dpl.fem import (
-    DirichletBC,
     Load,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    box,
     rectangle,
     solve,
     symmetries,
@@ -126,25 +118,6 @@ def test_gradients_with_respect_to_the_force_are_those_of_differences(surrogate_
     with torch.no_grad():
         expected = (work(force + step) - work(force - step)) / 2
     assert torch.isclose((force.grad * step).sum(), expected, rtol=1e-4)
-
-
-def test_moved_supports_keep_their_displacements(surrogate_of):
-    moved = DirichletBC(region=Plane(0, 4.0), value=[0.05, None, None])
-    body = Problem.build(
-        box((4, 1, 1), (5, 3, 3)), NeoHookeanLn(0.3), fixed=Plane(0, 0.0), supports=[moved]
-    )
-    newton = Newton(body)
-    scene = Scene(body, ModalLoads(newton.linear_solver, n_modes=3, deflection=0.1), newton)
-    surrogate, load = surrogate_of(scene), scene.loads.sample(0, range(3))
-    linear = surrogate.base.solve(load)
-    product = body.tangent_product(torch.zeros_like(linear), linear)
-    residual = (product - load.force)[:, body.free].norm(dim=1)
-    assert (residual < 1e-5 * product.flatten(1).norm(dim=1)).all()
-    with torch.no_grad():
-        answer = surrogate.predict(load)
-    fixed = ~body.free
-    assert torch.equal(answer[:, fixed], body.prescribed[fixed].expand(3, -1))
-    assert body.prescribed[fixed].any()
 
 
 def test_training_uses_the_linear_solutions_that_were_computed_before(scene, batch, monkeypatch):
