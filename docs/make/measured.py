@@ -338,7 +338,7 @@ def shown(text: str, column: str = "") -> str:
     if number != number or abs(number) == float("inf"):
         return text
     if column.startswith("SNR"):
-        return f"{number:.1f}"
+        return f"{round(number, 1) + 0.0:.1f}"  # no minus sign before zero
     if number == int(number) and abs(number) < 1e12:
         return f"{int(number):,}"
     if 1e-3 <= abs(number) < 1e4:
