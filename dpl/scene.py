@@ -23,6 +23,7 @@ from dpl.fem import (
     solve,
 )
 from dpl.fem.identity import plain, sha256_of
+from dpl.fem.linear.backends import factorisation_work
 from dpl.fem.solvers.solution import as_column
 
 CORRECTOR_STREAM = 6  # stream of the loads on which the corrector is chosen
@@ -34,7 +35,8 @@ CELLS = {  # scikit-fem's names of shapes and those of bodies, in the plural
     "Quadrilateral": "quadrilaterals",
     "Triangular": "triangles",
 }
-MAX_MEAN_STEPS = 8  # conjugate gradient steps, on average, that cost less than a factor
+MAX_MEAN_STEPS = 8  # of conjugate gradients, on average, with a factor that is near the tangent
+MIN_FACTORISATION_WORK = 6e7  # multiply-adds that take as long as conjugate gradients in Newton
 
 
 class _Sample(NamedTuple):
@@ -111,8 +113,18 @@ class Scene:
         """Newton's method as it continues from a prediction.
 
         It preconditions with the corotated factor of K(0) in place of new factors where that makes
-        conjugate gradients short: on compact bodies, seldom on thin ones. The mean number of steps
-        for a few random loads decides.
+        conjugate gradients short and a factorisation takes longer than they do.
+        """
+        is_dear = factorisation_work(self.problem.pattern) > MIN_FACTORISATION_WORK
+        corotational = is_dear and self.is_compact
+        return replace(self.newton, corotational=corotational, abandon_indefinite_guess=True)
+
+    @cached_property
+    def is_compact(self) -> bool:
+        """Whether the corotated factor of K(0) is near the tangent under a few random loads.
+
+        It is on compact bodies, seldom on thin ones. The mean number of steps of conjugate
+        gradients decides.
         """
         loads = self.loads.sample((0, CORRECTOR_STREAM), range(3)).unbatch()
         steps = []
@@ -120,8 +132,7 @@ class Scene:
             displacement = solve(self.solver, load).displacement
             preconditioner = self.linear.with_parameters(load.parameters).corotational
             steps.append(preconditioner.count_iterations(displacement))
-        is_short = sum(steps) <= MAX_MEAN_STEPS * len(steps)
-        return replace(self.newton, corotational=is_short, abandon_indefinite_guess=True)
+        return sum(steps) <= MAX_MEAN_STEPS * len(steps)
 
     @property
     def length(self) -> float:

@@ -15,7 +15,7 @@ from dpl.evaluation.nodal_fields import nodal_fields
 from dpl.evaluation.tables import power, share, show_cells
 from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
 from dpl.fem import LinearSolver, Load, Newton, Problem, Solution, Solver, Status, write_mesh
-from dpl.inference import Corrected, Direct, Hybrid, Simulator, corotational_error
+from dpl.inference import Corrected, Direct, Hybrid, Simulator, estimate_error
 from dpl.models import HasCorrection
 from dpl.scene import Sample, Scene
 from dpl.system.threads import one_thread
@@ -42,7 +42,7 @@ class SolverResult:
         max_iterations: Maximum number of linear solves.
         ms: Median wall time of one load, with its residual and min det F [ms].
         ms_p99: 99th percentile of this time [ms].
-        estimated_error: Median of the estimated relative error, see `corotational_error` [-];
+        estimated_error: Median of the estimated relative error, see `estimate_error` [-];
             infinite: not computed.
         latency: Latency of `sim(force)` and of the bare network; empty for other solvers.
     """
@@ -167,7 +167,7 @@ def evaluate(
 def _estimated(scene: Scene, test: Sample, displacement: Tensor) -> float:
     """Return the median of the estimated relative errors of displacements (B, N, D) [-]."""
     pairs = zip(test.load.unbatch(), displacement.split(1), strict=True)
-    errors = [corotational_error(scene.linear, load, found) for load, found in pairs]
+    errors = [estimate_error(scene.linear, load, found).error for load, found in pairs]
     return float(np.median(errors))
 
 

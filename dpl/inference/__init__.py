@@ -8,8 +8,6 @@ if TYPE_CHECKING:
     from dpl.inference.answer import Answer
     from dpl.inference.error_estimate import (
         ErrorEstimate,
-        corotational_correction,
-        corotational_error,
         estimate_error,
         nearest,
     )

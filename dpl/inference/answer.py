@@ -30,7 +30,8 @@ class Answer:
         converged: True if the residual is below the tolerance of the call (without one, that of
             the scene) and no element is inverted. It is False also where rounding does not allow
             this residual. The estimated error has no part in it.
-        negative_pivots: Number of negative eigenvalues of the tangent; -1: not examined.
+        negative_pivots: Number of negative eigenvalues of the tangent; 1 if there are some, not
+            counted; -1: not examined.
         amplitude: Largest modal load over the largest of the training [-], see
             `ModalLoads.project`.
         out_of_span: Norm of the part of the force that is no combination of the modes of the
@@ -90,6 +91,8 @@ def summarise(
             words += f", UNSTABLE ({pivots} negative eigenvalues)"
         else:
             words += ", stable" if pivots == 0 else ", stability not examined"
+    elif int(state.negative_pivots) > 0:
+        words += ", the tangent has negative curvature: near or beyond a critical load"
     if int(state.status) == Status.NO_VALID_EQUILIBRIUM:
         words += f"; no equilibrium found beyond {float(state.load_factor):.2f} of the load"
     if not outside:

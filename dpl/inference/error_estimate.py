@@ -1,4 +1,4 @@
-"""Estimate of the error of a displacement by one corotational correction."""
+"""Estimate of the error of a displacement by a few conjugate gradient steps of Newton's method."""
 
 import math
 from typing import NamedTuple
@@ -7,11 +7,18 @@ import numpy as np
 from torch import Tensor
 
 from dpl.fem import LinearSolver, Load, Newton
+from dpl.fem.linear.interface import Array
+from dpl.fem.linear.krylov import krylov_steps
 from dpl.fem.problem import Evaluation
 from dpl.fem.rom.subspace_newton import scaled_norm
 
 RTOL = 1e-2  # relative residual of iterative solves for an estimate [-]
 SUFFICIENT = 2e-3  # steps leave an error of 1e-3 in the modes, and about as much outside [-]
+PRODUCTS = 3  # largest number of products with the tangent
+REST = 0.25  # part of the correction, bounding the rest of it, at which the steps end [-]
+NEAR = 0.1  # relative residual below which negative curvature is that of the equilibrium [-]
+DOUBT = 3.0  # factor of the estimate where negative curvature is that of spurious stresses
+DIFFERENCE = 1e-5  # change of u, relative to u, by which products are computed [-]
 
 
 class ErrorEstimate(NamedTuple):
@@ -19,59 +26,13 @@ class ErrorEstimate(NamedTuple):
 
     Attributes:
         error: Estimated relative error [-].
-        correction: The `corotational_correction` behind it, (1, N, D) [-]; None if there is none.
+        correction: The correction behind it, (1, N, D) [-]; None if there is none.
+        is_indefinite: The tangent has negative curvature near equilibrium.
     """
 
     error: float
     correction: Tensor | None = None
-
-
-def corotational_correction(
-    solver: LinearSolver, load: Load, displacement: Tensor, evaluation: Evaluation | None = None
-) -> Tensor | None:
-    """Return M R(u), (1, N, D) [-], an approximation of Newton's correction of a displacement.
-
-    M is the inverse of K(0) in the rotated frames of the nodes at u. The correction costs one
-    residual and one solve with a stored factor. If the law has parameters, K(0) is that at the
-    centre of their ranges, so that no load needs a new factor.
-
-    The result is None if an element is inverted or u is not finite.
-
-    Source: Mueller, Dorsey, McMillan, Jagnow, Cutler (2002), Stable real-time deformations, section
-    3.2 (rotated factor).
-
-    Args:
-        solver: Linear solver of the body with the factor of K(0).
-        load: The load, B = 1.
-        displacement: u, (1, N, D) [-].
-        evaluation: Internal force and min det F at u, if known.
-    """
-    problem = solver.problem.with_parameters(load.parameters)
-    internal, volume = evaluation or problem.evaluate(displacement)
-    right = problem.restrict((load.force - internal)[0])
-    if not bool(volume > 0) or not np.isfinite(right).all():
-        return None
-    return problem.extend(solver.reference.corotational.at(displacement).solve(right, RTOL))[None]
-
-
-def corotational_error(
-    solver: LinearSolver, load: Load, displacement: Tensor, evaluation: Evaluation | None = None
-) -> float:
-    """Return ||M R(u)|| / ||u|| [-], an estimate of the relative error of a displacement.
-
-    M R(u) is the `corotational_correction`. Unlike the residual the estimate does not depend on the
-    stiffness of the body against the error.
-
-    The estimate is infinite if an element is inverted, if u is not finite, or if u is zero and not
-    in equilibrium.
-
-    Source: Deuflhard (2011), Newton Methods for Nonlinear Problems, section 3.3 (corrections as
-    error estimates).
-
-    Args:
-        solver, load, displacement, evaluation: See `corotational_correction`.
-    """
-    return _relative(corotational_correction(solver, load, displacement, evaluation), displacement)
+    is_indefinite: bool = False
 
 
 def estimate_error(
@@ -80,49 +41,89 @@ def estimate_error(
     displacement: Tensor,
     evaluation: Evaluation | None = None,
     *,
-    in_modes: float = math.inf,
-    sufficient: float = SUFFICIENT,
+    products: int = PRODUCTS,
 ) -> ErrorEstimate:
     """Return the estimated relative error of a displacement, with the correction behind it.
 
-    The error is the smaller one of `corotational_error` and an estimate in the modes of a model.
-    The former is not computed if the latter is small enough.
+    Newton's correction K(u)^-1 R is approximated by conjugate gradients, preconditioned by M, the
+    inverse of K(0) in the rotated frames of the nodes at u. The error after k steps is at most
+    ||z|| / t, with z = M (R - K(u) x) and the smallest eigenvalue t of M K(u), which the smallest
+    Ritz value approximates from above. t is small where the load softens the body; Newton's
+    correction is then too short. With s = min(t, 1) the estimate is (2 - s) (||x|| + ||z|| / s)
+    over ||u||. Steps are made until ||z|| / s is at most `REST` times ||x||.
+
+    A step costs one residual, which differs by K(u) times its direction, and one solve with the
+    stored factor of K(0). If the law has parameters, this is the factor at the centre of their
+    ranges, so that no load needs a new one.
+
+    The estimate is infinite if an element is inverted, if u is not finite, and if u is zero and not
+    in equilibrium. The correction is None in the first two cases. If a step finds negative
+    curvature, the estimate is infinite where the relative residual is below `NEAR`: an equilibrium
+    near u is unstable or near a critical load. Where the residual is larger, stresses of the error
+    itself cause it, and the estimate is `DOUBT` ||M R|| / ||u||.
+
+    Source: Deuflhard (2011), Newton Methods for Nonlinear Problems, section 3.3 (corrections as
+    error estimates); Mueller, Dorsey, McMillan, Jagnow, Cutler (2002), Stable real-time
+    deformations, section 3.2 (rotated factor).
 
     Args:
-        solver, load, displacement, evaluation: See `corotational_correction`.
-        in_modes: Newton's correction in the modes, relative to the displacement, plus the known
-            error outside of them [-]; infinite if the latter is unknown, or known for other loads.
-        sufficient: Estimate in the modes up to which that is the result [-].
+        solver: Linear solver of the body with the factor of K(0).
+        load: The load, B = 1.
+        displacement: u, (1, N, D) [-].
+        evaluation: Internal force and min det F at u, if known.
+        products: Largest number of steps; with 0 the estimate is ||M R|| / ||u||, too small where
+            the load softens the body.
     """
-    if in_modes <= sufficient:
-        return ErrorEstimate(in_modes)
-    correction = corotational_correction(solver, load, displacement, evaluation)
-    return ErrorEstimate(min(in_modes, _relative(correction, displacement)), correction)
+    problem = solver.problem.with_parameters(load.parameters)
+    internal, volume = evaluation or problem.evaluate(displacement)
+    right = problem.restrict((load.force - internal)[0])
+    size = scaled_norm(displacement.numpy().ravel())
+    if not bool(volume > 0) or not np.isfinite(right).all():
+        return ErrorEstimate(math.inf)
+    inverse = solver.reference.corotational.at(displacement)
+
+    def product(direction: Array) -> Array:
+        length = DIFFERENCE * size / scaled_norm(direction)
+        moved = problem.evaluate(displacement + length * problem.extend(direction)[None])
+        return problem.restrict((moved.internal - internal)[0]) / length
+
+    largest = float(np.abs(right).max(initial=0.0))
+    unit = 2.0 ** np.clip(np.frexp(largest)[1], -1021, 1023)
+    steps = krylov_steps(product, lambda part: inverse.solve(part, RTOL), right / unit)
+    first = 0.0
+    for k, (x, z, ritz) in enumerate(steps):
+        correction = problem.extend(unit * (x if k else z))[None]
+        first = first if k else scaled_norm(z)
+        if not ritz > 0:
+            is_near = bool(problem.relative_residual_of(internal, load.force) < NEAR)
+            error = math.inf if is_near else DOUBT * float(unit * first) / size
+            return ErrorEstimate(error, correction, is_indefinite=is_near)
+        least, made = min(ritz, 1.0), scaled_norm(x)
+        rest = scaled_norm(z) / least
+        if size == 0 or k == products or rest <= REST * made:
+            break
+    distance = (2 - least) * (made + rest)
+    if size == 0:
+        return ErrorEstimate(math.inf if distance else 0.0, correction)
+    return ErrorEstimate(float(unit * distance) / size, correction)
 
 
 def nearest(newton: Newton, load: Load, guesses: list[Tensor]) -> Tensor:
     """Return the guess (1, N, D) with the smallest estimated distance from equilibrium.
 
-    The distance is the ||M R(u)|| of `corotational_error`. It is infinite for a guess that inverts
-    an element or is not finite.
+    The distance is that of `estimate_error` without products. It is infinite for a guess that
+    inverts an element or is not finite.
 
     Args:
         newton: Newton's method, whose factor of K(0) is used.
         load: The load, B = 1.
         guesses: Displacements, (1, N, D) [-] each.
     """
-    corrections = [corotational_correction(newton.linear_solver, load, one) for one in guesses]
-    return guesses[min(range(len(guesses)), key=lambda k: _norm(corrections[k]))]
+    solver = newton.linear_solver
+    found = [estimate_error(solver, load, u, products=0).correction for u in guesses]
+    return guesses[min(range(len(guesses)), key=lambda k: _norm(found[k]))]
 
 
 def _norm(correction: Tensor | None) -> float:
     """Return the norm of a correction; infinite if there is none."""
     return math.inf if correction is None else scaled_norm(correction.numpy().ravel())
-
-
-def _relative(correction: Tensor | None, displacement: Tensor) -> float:
-    """Return the norm of a correction over that of the displacement, see `corotational_error`."""
-    size, whole = _norm(correction), scaled_norm(displacement.numpy().ravel())
-    if whole == 0 or size == math.inf:
-        return math.inf if size else 0.0
-    return size / whole

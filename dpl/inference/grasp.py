@@ -15,7 +15,7 @@ from torch import Tensor
 from dpl.fem import AndersonSolver, Load, Newton, RigidPatch, Solution, evaluate_solution
 from dpl.inference.answer import summarise
 from dpl.inference.arguments import as_load, as_numbers
-from dpl.inference.error_estimate import corotational_error
+from dpl.inference.error_estimate import estimate_error
 from dpl.inference.grasp_forces import Forces, predicted_forces
 from dpl.inference.hybrid import Hybrid
 from dpl.inference.request import Budget, Request
@@ -41,7 +41,7 @@ class GraspAnswer:
         motion_error: Largest distance of a held node from its prescribed place [m].
         residual: Relative residual at all other nodes [-], see `Problem.relative_residual_of`; the
             forces of the gripper count as load.
-        error: Estimated relative error of the displacement [-], see `corotational_error`, plus
+        error: Estimated relative error of the displacement [-], see `estimate_error`, plus
             `motion_error` over the largest displacement of the body: no bound.
         volume_ratio: min det F [-]; an element is inverted if it is not above 0.
         converged: True if the motion is met exactly, the residual is below the tolerance and no
@@ -137,7 +137,7 @@ def evaluated(
     evaluation = newton.problem.evaluate(u)
     missed = patch.at(goal - patch.of_field(u[0])).norm(dim=1).max()
     largest = u.norm(dim=2).max().clamp(min=1e-300)
-    error = corotational_error(newton.linear_solver, load, u, evaluation)
+    error = estimate_error(newton.linear_solver, load, u, evaluation).error
     if force is None:
         force = patch.of_field(evaluation.internal[0] - load.force[0])
     return Held(method, state, force, float(missed), error + float(missed / largest))

@@ -209,7 +209,7 @@ def default_hybrid(predict: Predict, scene: Scene, tol: float | None = None) -> 
     """Return the hybrid solver of a scene.
 
     Anderson iterations precede Newton if the corotated factor of K(0) is a good preconditioner, see
-    `Scene.corrector`.
+    `Scene.is_compact`.
 
     Args:
         predict: Function from a load to displacements, (B, N, D) [-].
@@ -217,7 +217,7 @@ def default_hybrid(predict: Predict, scene: Scene, tol: float | None = None) -> 
         tol: Relative residual [-]; None: that of the scene.
     """
     newton = scene.corrector if tol is None else replace(scene.corrector, tol=tol)
-    return Hybrid(predict, newton, steps=AndersonSolver(newton) if newton.corotational else None)
+    return Hybrid(predict, newton, steps=AndersonSolver(newton) if scene.is_compact else None)
 
 
 def prefer_prediction(predicted: Solution, first: Solution) -> bool:

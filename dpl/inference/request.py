@@ -20,7 +20,9 @@ class Candidate(NamedTuple):
         method: As of `Answer`.
         state: The solution.
         error: Its estimated relative error [-]; None: not computed.
-        error_in_modes: Its estimated error by the modes of the model [-]; infinite: unknown.
+        error_in_modes: Newton's correction in the modes of the model, relative to it [-]; 0 without
+            modes.
+        error_outside: Its estimated relative error outside of the modes [-]; infinite: unknown.
         correction: The correction behind its estimated error, (1, N, D) [-]; None: not computed.
         evaluation: Internal force and min det F at its displacement, if known.
     """
@@ -28,7 +30,8 @@ class Candidate(NamedTuple):
     method: str
     state: Solution
     error: float | None = None
-    error_in_modes: float = math.inf
+    error_in_modes: float = 0.0
+    error_outside: float = math.inf
     correction: Tensor | None = None
     evaluation: Evaluation | None = None
 
@@ -76,6 +79,11 @@ class Request(NamedTuple):
     def is_more_than_prediction(self) -> bool:
         """True if other methods may follow the prediction."""
         return (self.tol, self.budget_ms, self.error) != (None, None, None)
+
+    @property
+    def skips_poor_predictions(self) -> bool:
+        """True if the result meets tolerances in any time, so that a prediction is a start only."""
+        return self.budget_ms is None and (self.tol, self.error) != (None, None)
 
     @property
     def is_for_error(self) -> bool:

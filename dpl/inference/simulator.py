@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -16,7 +17,12 @@ from dpl.fem.mesh.regions import Region
 from dpl.fem.solvers import concatenate
 from dpl.inference.answer import Answer, answer_like, summarise
 from dpl.inference.arguments import as_load, as_numbers
-from dpl.inference.error_estimate import SUFFICIENT, estimate_error, nearest
+from dpl.inference.error_estimate import (
+    PRODUCTS,
+    SUFFICIENT,
+    estimate_error,
+    nearest,
+)
 from dpl.inference.grasp import GraspAnswer, Gripper
 from dpl.inference.hybrid import default_hybrid
 from dpl.inference.request import Candidate, Request
@@ -28,8 +34,10 @@ from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
 ERROR = 1e-3  # estimated relative error above which they are made [-]
+POOR_STREAM = 9_003  # of the loads by which the predictions are judged
 PACE_DECAY = 0.9  # of a time from call to call
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
+MAX_RESIDUAL = 0.1  # above it the error outside of the modes is not that of the training [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 
 
@@ -146,11 +154,14 @@ class Simulator:
         load = as_load(self.scene, given, young, parameters)
         request = Request.checked(tol, budget_ms, error, warm=warm)
         with one_thread(), torch.inference_mode():
-            predictions = self.surrogate.predict(load)
+            skipped = request.skips_poor_predictions and self._is_poor
+            predictions = [None] * len(load.force)
+            if not skipped:
+                predictions = self.surrogate.predict(load).split(1)
             places = RangeCheck.of(self.surrogate, load)
             shared = (time.perf_counter() - begin) / len(load.force)
             found = []
-            members = load.unbatch(), predictions.split(1), places.split()
+            members = load.unbatch(), predictions, places.split()
             for single, prediction, place in zip(*members, strict=True):
                 begin = time.perf_counter() - shared
                 best = self._solve(single, prediction, place, request._replace(begin=begin))
@@ -247,19 +258,19 @@ class Simulator:
         }
 
     def _solve(
-        self, load: Load, prediction: Tensor, place: RangeCheck, request: Request
+        self, load: Load, prediction: Tensor | None, place: RangeCheck, request: Request
     ) -> Candidate:
         """Return the first solution that meets the tolerances, else the best one.
 
         Args:
             load: The load, B = 1.
-            prediction: The prediction of the network, (1, N, D) [-].
+            prediction: The prediction of the network, (1, N, D) [-]; None if it is not tried.
             place: Position of the load relative to the training range.
             request: Options of the call.
         """
         scene, tol = self.scene, request.residual_tol(self.scene)
         if not load.force.any() and not scene.problem.is_loaded_at_rest:
-            rest = evaluate_solution(scene.problem, torch.zeros_like(prediction), load, tol)
+            rest = evaluate_solution(scene.problem, torch.zeros_like(load.force), load, tol)
             return Candidate("rest", rest, 0.0)
         best: Candidate | None = None
         last: Candidate | None = None
@@ -278,43 +289,52 @@ class Simulator:
         state = state._replace(status=status, load_factor=ended.load_factor)
         return self._with_error(load, best._replace(state=state), request)
 
-    def _with_error(
-        self, load: Load, candidate: Candidate, request: Request, sufficient: float = SUFFICIENT
-    ) -> Candidate:
-        """Return a solution with its estimated error; see `estimate_error` for `sufficient`."""
+    def _with_error(self, load: Load, candidate: Candidate, request: Request) -> Candidate:
+        """Return a solution with its estimated error.
+
+        The error in the modes and the known one outside of them are the estimate if their sum is at
+        most the requested one, or `SUFFICIENT`. Otherwise it is the larger one of the error in the
+        modes and of `estimate_error`.
+        """
         if candidate.error is not None:
             return candidate
-        begin = time.perf_counter()
-        found = estimate_error(
-            self.scene.linear, load, candidate.state.displacement, candidate.evaluation,
-            in_modes=candidate.error_in_modes,
-            sufficient=sufficient if request.error is None else request.error,
-        )  # fmt: skip
+        known = candidate.error_in_modes + candidate.error_outside
+        if known <= (SUFFICIENT if request.error is None else request.error):
+            return candidate._replace(error=known)
+        begin, state = time.perf_counter(), candidate.state
+        found = estimate_error(self.scene.linear, load, state.displacement, candidate.evaluation)
         self._estimate_time = time.perf_counter() - begin
-        return candidate._replace(error=found.error, correction=found.correction)
+        if found.is_indefinite:
+            state = state.unstable()
+        error = max(candidate.error_in_modes, found.error)
+        return candidate._replace(state=state, error=error, correction=found.correction)
 
     def _candidates(
-        self, load: Load, prediction: Tensor, place: RangeCheck, request: Request
+        self, load: Load, prediction: Tensor | None, place: RangeCheck, request: Request
     ) -> Iterator[Candidate]:
-        """Yield the solutions of the methods, the cheapest first; see `_solve`."""
+        """Yield the solutions of the methods, the cheapest first; see `_solve`.
+
+        The hybrid continues from the prediction, or with `warm` from the last displacement, if that
+        is near equilibrium. Otherwise Newton's method starts from rest, since its iterates from far
+        seldom lead to a solution.
+        """
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
         self._pace = self._first_pace
-        for first in self._predictions(load, prediction, place, request):
-            yield first  # the last one is the best
-        if not request.is_more_than_prediction:
-            return
+        guesses = []
+        if prediction is not None:
+            for first in self._predictions(load, prediction, place, request):
+                yield first  # the last one is the best
+            if not request.is_more_than_prediction:
+                return
+            guesses = [] if self._is_far(load, first) else [first.state.displacement]
         clock = time.perf_counter()
-        guesses, before = [first.state.displacement], self._before
-        is_far = self._with_error(load, first, request, sufficient=FAR).known_error > FAR
-        if is_far or place.amplitude < MAX_LINEAR_AMPLITUDE:
-            linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
-            guesses += [linear] * is_far
+        if request.warm and self._before and torch.equal(self._before[0], load.parameters):
+            guesses.append(self._before[1])
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
+            linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
             yield _evaluated("linear", problem, linear, load, tol)
-        if request.warm and before is not None and torch.equal(before[0], load.parameters):
-            guesses.append(before[1])
-        start = nearest(self.scene.newton, load, guesses) if len(guesses) > 1 else guesses[0]
-        for state in default_hybrid(lambda load: start, self.scene, tol).iterate(load):
+        start = nearest(self.scene.newton, load, guesses) if guesses else None
+        for state in self._iterates(load, start, tol):
             if int(state.iterations):
                 now = time.perf_counter()
                 self._pace, clock = now - clock, now
@@ -323,6 +343,39 @@ class Simulator:
             elif not state.converged:  # the initial state, which has been evaluated
                 continue
             yield Candidate("hybrid" if state.from_guess else "full Newton", state)
+
+    def _iterates(self, load: Load, start: Tensor | None, tol: float) -> Iterator[Solution]:
+        """Return the iterates of the hybrid from a start, of Newton's method without one."""
+        if start is None:
+            return replace(self.scene.corrector, tol=tol).iterate(load)
+        return default_hybrid(lambda load: start, self.scene, tol).iterate(load)
+
+    @cached_property
+    def _is_poor(self) -> bool:
+        """Whether predictions of a few random loads are far from equilibrium.
+
+        Newton's method from rest is faster than it is to try such predictions.
+        """
+        problem, tol = self.scene.problem, self.scene.solver.tol
+        return all(
+            self._is_far(
+                load, _evaluated("network", problem, self.surrogate.predict(load), load, tol)
+            )
+            for load in self.scene.loads.sample((0, POOR_STREAM), range(3)).unbatch()
+        )
+
+    def _is_far(self, load: Load, candidate: Candidate) -> bool:
+        """Return True if the estimated error of a prediction exceeds `FAR`."""
+        error = candidate.error
+        if error is None:
+            error = candidate.error_in_modes + candidate.error_outside
+        if error > FAR and candidate.error is None:
+            products = 0 if self.scene.is_compact else PRODUCTS
+            error = estimate_error(
+                self.scene.linear, load, candidate.state.displacement, candidate.evaluation,
+                products=products,
+            ).error  # fmt: skip
+        return not error <= FAR
 
     def _predictions(
         self, load: Load, prediction: Tensor, place: RangeCheck, request: Request
@@ -334,7 +387,7 @@ class Simulator:
         estimated error is too large and decreases.
         """
         last = self._in_modes(load, prediction, place, request)
-        if self.newton is not None and request.is_for_error:
+        if request.error is not None or (self.newton is not None and request.is_for_error):
             last = self._with_error(load, last, request)
         yield last
         sufficient = SUFFICIENT if request.error is None else request.error
@@ -357,8 +410,6 @@ class Simulator:
         if self.newton is None or not guess.abs().amax().isfinite():
             return _evaluated("network", problem, guess, load, tol)
         wanted = ERROR if request.error is None else request.error
-        if request.tol is not None:
-            wanted = min(wanted, self.newton.error_tol)
         begin, pace = time.perf_counter(), 0.0
         states = self.newton.states(
             load, guess=guess, error_tol=wanted, max_iter=self.steps - taken,
@@ -372,9 +423,14 @@ class Simulator:
             iterations=taken + state.iterations, from_guess=True, evaluation=state.evaluation,
         )  # fmt: skip
         outside = self.newton.outside_error  # 0 if it is not known
-        within = state.error + outside if outside > 0 and not place.outside else math.inf
-        method = "corrected" if taken + state.iterations else "network"
-        return Candidate(method, solution, error_in_modes=within, evaluation=state.evaluation)
+        is_known = outside > 0 and not place.outside and bool(solution.residual < MAX_RESIDUAL)
+        return Candidate(
+            "corrected" if taken + state.iterations else "network",
+            solution,
+            error_in_modes=state.error,
+            error_outside=outside if is_known else math.inf,
+            evaluation=state.evaluation,
+        )
 
     def _with_stability(self, load: Load, state: Solution) -> Solution:
         """Return a solution with the number of negative eigenvalues of its tangent."""

@@ -3,10 +3,11 @@
 import importlib
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import islice
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigvalsh_tridiagonal
@@ -92,46 +93,76 @@ def conjugate_gradients(
     raise SingularMatrix(f"no convergence to {rtol:g} in {max_iter} conjugate gradient steps")
 
 
-def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int = 8) -> float:
-    """Return the smallest Ritz value of M^-1 K, -inf if K is not positive definite.
+class KrylovStep(NamedTuple):
+    """State of conjugate gradients after some steps.
 
-    M is near K, so that all eigenvalues but a few are near 1 and a few Lanczos steps from a fixed
-    random vector find the others. More than three are taken only if the smallest is below 1/2.
+    Attributes:
+        solution: x, (n,).
+        preconditioned: M^-1 (right - K x), (n,).
+        ritz: Smallest Ritz value of M^-1 K; infinite before the first step, -inf where K is not
+            positive definite.
+    """
+
+    solution: Array
+    preconditioned: Array
+    ritz: float
+
+
+def krylov_steps(product: Map, precondition: Map, right: Array) -> Iterator[KrylovStep]:
+    """Yield the initial state of conjugate gradients from zero and the state after each step.
+
+    The iteration ends after a direction of negative curvature and at the solution.
 
     Source: Saad (2003), Iterative Methods for Sparse Linear Systems, section 6.7.3 (Ritz values
     from conjugate gradients).
 
     Args:
         product, precondition: As of `conjugate_gradients`.
-        size: n.
-        steps: Largest number of Lanczos steps.
+        right: Right-hand side, (n,), of order one.
     """
-    residual = np.random.default_rng(0).standard_normal(size)
+    x, residual = np.zeros_like(right), right.copy()
     z = precondition(residual)
     direction, rz = z.copy(), float(residual @ z)
     diagonal: list[float] = []
     off_diagonal: list[float] = []
-    least, carried = float("inf"), 0.0
-    for k in range(min(steps, size)):
+    carried = 0.0
+    yield KrylovStep(x, z, math.inf)
+    while rz > 0:
         image = product(direction)
         curvature = float(direction @ image)
         if not curvature > 0:
-            return -np.inf
+            yield KrylovStep(x, z, -math.inf)
+            return
         length = rz / curvature
         diagonal.append(1 / length + carried)
-        least = float(eigvalsh_tridiagonal(diagonal, off_diagonal)[0])
-        if k >= 2 and least > 0.5:
-            break
+        ritz = float(eigvalsh_tridiagonal(diagonal, off_diagonal)[0])
+        x = x + length * direction
         residual -= length * image
         z = precondition(residual)
+        yield KrylovStep(x, z, ritz)
         rz, before = float(residual @ z), rz
-        if not rz > 0:
-            break
         ratio = rz / before
         carried = ratio / length
-        off_diagonal.append(math.sqrt(ratio) / length)
-        direction *= ratio
-        direction += z
+        off_diagonal.append(math.sqrt(max(ratio, 0.0)) / length)
+        direction = z + ratio * direction
+
+
+def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int = 8) -> float:
+    """Return the smallest Ritz value of M^-1 K, -inf if K is not positive definite.
+
+    M is near K, so that all eigenvalues but a few are near 1 and a few Lanczos steps from a fixed
+    random vector find the others. More than three are taken only if the smallest is below 1/2.
+
+    Args:
+        product, precondition: As of `conjugate_gradients`.
+        size: n.
+        steps: Largest number of Lanczos steps.
+    """
+    least, right = math.inf, np.random.default_rng(0).standard_normal(size)
+    for k, step in enumerate(islice(krylov_steps(product, precondition, right), steps + 1)):
+        least = step.ritz
+        if k >= 3 and least > 0.5:
+            break
     return least
 
 

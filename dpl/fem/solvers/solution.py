@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from enum import IntEnum
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -97,6 +97,12 @@ class Solution(NamedTuple):
     def converged(self) -> Tensor:
         """Whether the state is an equilibrium to the tolerance without inverted elements, (B,)."""
         return self.status <= Status.UNSTABLE
+
+    def unstable(self) -> Self:
+        """Return the solution with a tangent of which negative curvature is known, B = 1."""
+        pivots = torch.where(self.negative_pivots > 0, self.negative_pivots, 1)
+        status = torch.where(self.converged, int(Status.UNSTABLE), self.status)
+        return self._replace(negative_pivots=pivots, status=status)
 
     @property
     def stable(self) -> Tensor:
