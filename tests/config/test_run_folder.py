@@ -109,6 +109,16 @@ BAD = {  # override -> what the message must name
     "material._target_=3": r"material\._target_ = 3 must be a text",
     "+mesh._args_=[1]": r"mesh\._args_: .* has no such option",
     "solver._partial_=yes_please": r"solver\._partial_ = 'yes_please' must be true or false",
+    "material.poisson={_target_:dpl.fem.CellField,values:[0.1]}": (
+        r"^material\.poisson: values of shape \(1,\) must be 16 finite numbers"
+    ),
+    "material.poisson={_target_:dpl.fem.CellField,values:a,file:nowhere.vtu}": (
+        r"^material\.poisson: nowhere\.vtu: no such mesh file"
+    ),
+    "+forces.muscle={_target_:dpl.fem.ActiveStress,value:1.0,"
+    "directions:{_target_:dpl.fem.FibreData,fibre:f,file:nowhere.vtu}}": (
+        r"^forces\.muscle: directions: nowhere\.vtu: no such mesh file"
+    ),
     "mean_dilatation=1": r"mean_dilatation = 1 must be true or false",
 }
 
