@@ -27,7 +27,7 @@ class FileLoads(CombinedLoads):
 
     Attributes:
         path: An array in .npy, or a .npz file with one array: nodal forces (S, N, D) [N] (2D:
-            [N/m]), the nodes in the order of `Problem.points`.
+            [N/m]), 2^27 numbers at most, the nodes in the order of `Problem.points`.
         factor: Smallest and largest factor; None: `deflection` decides, and the unit of the forces
             has no effect.
     """
