@@ -213,9 +213,9 @@ def fits_in_one_step(folder: Path) -> bool:
     """Return True if the model of a run is fitted, so that its training cannot be resumed."""
     from hydra.utils import get_object
 
-    from dpl.config.run_folder import read_config
+    from dpl.config.run_folder import checked_config
 
-    model = read_config(folder / "config.yaml").get("model", {})
+    model = checked_config(folder / "config.yaml").get("model", {})
     return callable(getattr(get_object(model.get("_target_", "builtins.object")), "fit", None))
 
 

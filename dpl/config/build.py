@@ -42,7 +42,7 @@ SCENE = (  # keys of a scene; those of a surrogate
 )
 NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
 NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its result
-    *("run", "folder", "ckpt_path", "data.folder"),
+    *("run", "folder", "ckpt_path", "trust", "data.folder"),
     *("callbacks", "logger", "paths", "extras", "trainer.plugins"),
 }
 TIME = re.compile(r"(?:(\d+):)?(\d+):(\d\d):(\d\d)")  # [DD:]HH:MM:SS

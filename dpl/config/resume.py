@@ -12,12 +12,18 @@ from omegaconf import DictConfig, OmegaConf
 from dpl import models, training
 from dpl.config import validation
 from dpl.config.build import NOT_IDENTITY, error_in, instantiate, to_container
-from dpl.config.run_folder import MESH, has_mesh_file, read_config, with_copied_mesh
+from dpl.config.run_folder import (
+    MESH,
+    checked_config,
+    has_mesh_file,
+    read_config,
+    with_copied_mesh,
+)
 from dpl.config.validation import ConfigError
 from dpl.fem import write_mesh_exactly
 from dpl.system.files import atomic_write
 
-OF_THE_SESSION = {"run", "folder", "ckpt_path", "callbacks", "logger", "paths", "extras"}
+OF_THE_SESSION = {"run", "folder", "ckpt_path", "callbacks", "logger", "paths", "extras", "trust"}
 MACHINE = tuple(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy"))
 MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
     *(f"trainer.max_{unit}" for unit in ("epochs", "steps", "time")),
@@ -65,23 +71,15 @@ def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
 
     Raises:
         ConfigError: The configuration of the run cannot be read, or it calls an object outside this
-            package that the command line does not name.
+            package that neither `cfg` calls in the same place nor `trust=true` allows.
     """
     checkpoint = _resumed(cfg)
     path = None if checkpoint is None else checkpoint.parent.parent / "config.yaml"
     if path is None or not path.is_file():
         return cfg
     requested = to_container(cfg)
-    before = read_config(path)
+    before = checked_config(path, trust=cfg.get("trust") or requested)
     kept = {key: value for key, value in before.items() if key not in OF_THE_SESSION}
-    if "trainer" in kept and "trainer" in requested:
-        own = ("_target_", "_partial_", "plugins")  # calls, never those of the file
-        kept["trainer"] |= {key: requested["trainer"].get(key) for key in own}
-    unnamed = {k: v for k, v in kept.items() if k != "trainer" and v != requested.get(k)}
-    try:
-        validation.check(unnamed, unnamed, trust=False)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}; repeat the overrides of the run") from error
     found, given = OmegaConf.create({**requested, **kept}), OmegaConf.create(requested)
     for one in OverridesParser.create().parse_overrides(list(overrides)):
         key = one.key_or_group

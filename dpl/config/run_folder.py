@@ -3,7 +3,7 @@
 import contextlib
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,7 +19,6 @@ from dpl.config.build import (
     SCENE,
     build_scene,
     build_surrogate,
-    check,
     hyperparameters,
     instantiate,
     moduli,
@@ -69,6 +68,24 @@ def read_config(path: Path) -> dict[str, Any]:
     return found
 
 
+def checked_config(path: Path, *, trust: bool | Mapping[str, Any] = False) -> dict[str, Any]:
+    """Return the configuration of a run whose objects may be called.
+
+    Args:
+        path: Its file.
+        trust: Allow calls of any object, or of those of another configuration, see `check`.
+
+    Raises:
+        ConfigError: It cannot be read, is invalid, or calls an object that is not trusted.
+    """
+    found = read_config(path)
+    try:
+        validation.check(found, found, trust=trust)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return found
+
+
 def options_of_run(folder: Path) -> dict[str, Any]:
     """Return the hyperparameters of a run, see `hyperparameters`; none without configuration."""
     path = folder / "config.yaml"
@@ -101,11 +118,7 @@ def load_run(
     for path in (config, best):
         if not path.is_file():
             raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
-    found = read_config(config)
-    for key in ("trainer", "callbacks", "logger"):  # none of their objects is called
-        found.pop(key, None)
-    cfg = OmegaConf.create(found)
-    check(cfg, trust=trust)
+    cfg = OmegaConf.create(checked_config(config, trust=trust))
     with _usable(best):
         checkpoint = checkpoints.read(best)
         points = checkpoint.get("OfflineData", {}).get("points")

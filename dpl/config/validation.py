@@ -18,8 +18,8 @@ Keys = Sequence[tuple[Any, ...]]  # rows of type, names, and smallest and larges
 BELOW_1 = math.nextafter(1.0, 0.0)  # largest value of a key that must be below 1
 KEYS: Keys = (  # of all commands
     (dict, "mesh material loads solver data model loss optimizer trainer"),
-    (dict | None, "fixed regions supports forces scheduler callbacks logger paths extras"),
-    (dict | None, "galerkin corrected"),
+    (dict | None, "fixed regions supports forces scheduler callbacks logger galerkin corrected"),
+    (Mapping[str, float | str | bool | None] | None, "paths extras"),
     (bool, "mean_dilatation trust resume twice solve_reference profile galerkin_correction"),
     (str, "name host"),
     (Literal["generate", "verify", "repair"], "action"),
@@ -84,10 +84,14 @@ CLASSES_OF_DATA = {  # base class of `data`, by a key of the commands that need 
     "action": "dpl.data.dataset.DataSet",
     "trainer": "dpl.data.datamodule.OfflineData",
 }
-PARTS_OF_LAWS = {  # base classes of the objects that a law may contain
+PARTS = {  # base classes of the objects that a call in the file of a run may contain
+    *EXPECTED_TYPES["mesh"] | EXPECTED_TYPES["material"] | EXPECTED_TYPES["loads"] | REGIONS,
     "dpl.fem.materials.cell_field.CellField",
     "dpl.fem.materials.fibre_energies.FibreEnergy",
     "dpl.fem.materials.fibre_reinforced.FibreDirections",
+    "dpl.training.losses.loss.Loss",
+    "lightning.fabric.plugins.io.checkpoint_io.CheckpointIO",
+    "numpy.ndarray",
 }
 SEVERAL = ("regions", "supports", "forces", "callbacks", "logger")  # keys with calls by name
 PROTOCOLS = EXPECTED_TYPES["solver"] | EXPECTED_TYPES["loads"]  # a class needs their members only
@@ -96,7 +100,14 @@ TRUSTED_RESULTS = {  # of functions that a run may name: they compute and have n
     "numpy.ndarray",
     "torch.optim.lr_scheduler.LRScheduler",
 }
-OWN_PACKAGES = ("dpl.", "torch.optim.")  # packages of these classes
+OWN_PACKAGES = (  # packages whose classes the file of a run may name
+    *("dpl.", "torch.optim.", "lightning.Trainer", "lightning.pytorch.trainer."),
+    *("lightning.pytorch.callbacks.", "lightning.pytorch.loggers."),
+)
+VALUES = {  # type hints of values; others allow an object, which a call returns
+    *(bool, int, float, str, types.NoneType, Path, Literal),
+    *(Sequence, Iterable, list, tuple, Mapping, dict),
+}
 HYDRA_KEYS = {"_target_", "_partial_", "_recursive_", "_convert_"}  # options of Hydra in a call
 
 
@@ -109,16 +120,21 @@ class ConfigError(ValueError):
 
 
 def check(
-    written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = True, keys: Keys = ()
+    written: dict[str, Any],
+    resolved: dict[str, Any],
+    *,
+    trust: bool | Mapping[str, Any] = True,
+    keys: Keys = (),
 ) -> None:
     """Check a configuration against the signatures of its calls without calling anything.
 
     Args:
         written: The configuration with interpolations.
         resolved: The configuration without interpolations.
-        trust: Allow calls of any object. Otherwise only classes of this package and of PyTorch's
-            optimisers, and public functions of this package that return a mesh, an array or a
-            scheduler.
+        trust: Allow calls of any object, or only those of another configuration. Further calls must
+            be of classes of `OWN_PACKAGES`, or of public functions of this package that return one
+            of `TRUSTED_RESULTS`: of `EXPECTED_TYPES` under a key, and of `PARTS` within a call.
+            Nothing else is imported.
         keys: Keys of the command besides `KEYS`, in the same form.
 
     Raises:
@@ -126,6 +142,7 @@ def check(
             or an object does not exist or is not trusted.
     """
     known = _by_name((*KEYS, *keys))
+    trusted = dict(iter_nodes(trust)) if isinstance(trust, Mapping) else {}
     if unknown := sorted({str(key) for key in resolved} - set(known)):
         raise ConfigError(f"{unknown[0]}: there is no such key; {suggestion(unknown[0], known)}")
     for node in (written, resolved):  # `written` first: it names the key that was set
@@ -140,8 +157,9 @@ def check(
         if path in known:
             _check_value(path, node, *known[path])
             _check_keys(path, node, known)
-        if isinstance(node, dict) and "_target_" in node:
-            target = _target(path, node["_target_"], trust=trust)
+        if _names_target(node):
+            is_trusted = trust is True or node == trusted.get(path)
+            target = _target(path, node["_target_"], None if is_trusted else _kinds(path, resolved))
             if path == "data":
                 _check_data(node["_target_"], target, resolved)
             _check_call(path, node, target)
@@ -166,6 +184,11 @@ def _is_call(path: str, resolved: Mapping[str, Any]) -> bool:
     return len(below) == names_several(key, resolved.get(key)) and key in EXPECTED_TYPES
 
 
+def _kinds(path: str, resolved: Mapping[str, Any]) -> set[str]:
+    """Return the base classes of the object that a call at a path may return."""
+    return EXPECTED_TYPES[path.partition(".")[0]] if _is_call(path, resolved) else PARTS
+
+
 def _check_data(name: str, target: Any, resolved: Mapping[str, Any]) -> None:
     """Check that the class of `data` is the one that the command needs."""
     for key, kind in CLASSES_OF_DATA.items():
@@ -180,9 +203,7 @@ def _check_value(
     key: str, value: Any, hint: Any, least: float = -math.inf, most: float = math.inf
 ) -> None:
     """Check the type of a value, and the range of a number or of each number of a list."""
-    plain = {} if isinstance(value, dict) else value  # calls are checked by their signatures
-    if not matches_type(plain, hint):
-        raise ConfigError(f"{key} = {value!r} must be {_describe(hint)}")
+    _check_type(key, value, hint)
     if value == [] and key in NOT_EMPTY:
         raise ConfigError(f"{key} = [] must name one value or more")
     for one in value if isinstance(value, list) else [value]:
@@ -190,6 +211,12 @@ def _check_value(
         if isinstance(one, int | float) and not least <= one <= most and not unlimited:
             more = " or be -1" if key in UNLIMITED else ", 1 excluded" if most == BELOW_1 else ""
             raise ConfigError(f"{key} = {value} must lie between {least:g} and {most:.10g}{more}")
+
+
+def _check_type(path: str, value: Any, hint: Any) -> None:
+    if not matches_type(value, hint):
+        call = ", not a call" if _names_target(value) else ""
+        raise ConfigError(f"{path} = {value!r} must be {_describe(hint)}{call}")
 
 
 def _check_keys(path: str, node: Any, known: Collection[str]) -> None:
@@ -202,12 +229,12 @@ def _check_keys(path: str, node: Any, known: Collection[str]) -> None:
                 raise ConfigError(f"{path}.{key}: there is no such key; {message}")
 
 
-def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
-    """Return the class or function that a call names."""
-    foreign = f"{path} names {name}, which is none of this package's; not called without trust=true"
+def _target(path: str, name: Any, kinds: set[str] | None = None) -> Callable[..., Any]:
+    """Return the class or function that a call names; with `kinds`, a trusted one of them."""
+    foreign = f"{path} names {name}, which this key does not allow; not called without trust=true"
     if not isinstance(name, str):
         raise ConfigError(f"{path}._target_ = {name!r} must be a text")
-    if not trust and not name.startswith(OWN_PACKAGES):
+    if kinds is not None and not name.startswith(OWN_PACKAGES):
         raise ConfigError(foreign)
     try:
         module, _, attribute = name.rpartition(".")
@@ -218,20 +245,19 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
         ) from None
     if not callable(target):
         raise ConfigError(f"{path}._target_ = {name!r} cannot be called")
-    if not trust and not _is_trusted(target):
+    if kinds is not None and not _is_trusted(target, kinds):
         raise ConfigError(foreign)
     return target
 
 
-def _is_trusted(target: Any) -> bool:
-    """Return True for classes of parts, and functions that return one of `TRUSTED_RESULTS`.
+def _is_trusted(target: Any, kinds: set[str]) -> bool:
+    """Return True for classes of these kinds, and functions that return one that is trusted.
 
     The functions are the public ones of dpl, which the `__init__.py` of their folder lists. A new
     mesh function, sampling distribution or schedule therefore needs no entry in a list.
     """
     module = getattr(target, "__module__", None) or ""
     if inspect.isclass(target):
-        kinds = PARTS_OF_LAWS.union(*EXPECTED_TYPES.values())
         return f"{module}.".startswith(OWN_PACKAGES) and is_instance_of(target, kinds)
     if not inspect.isfunction(target) or not module.startswith("dpl."):
         return False
@@ -243,7 +269,7 @@ def _is_trusted(target: Any) -> bool:
     except NameError:  # an annotation that only type checkers resolve
         return False
     result = typing.get_origin(result) or result
-    return isinstance(result, type) and is_instance_of(result, TRUSTED_RESULTS)
+    return isinstance(result, type) and is_instance_of(result, kinds & TRUSTED_RESULTS)
 
 
 def is_instance_of(kind: type, names: set[str]) -> bool:
@@ -277,14 +303,14 @@ def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> 
         if key not in known:
             message = suggestion(str(key), known, f"{path}.")
             raise ConfigError(f"{path}.{key}: {node['_target_']} has no such option; {message}")
-        if key in hints and not matches_type(value, hints[key]):
-            raise ConfigError(f"{path}.{key} = {value!r} must be {_describe(hints[key])}")
+        if key in hints:
+            _check_type(f"{path}.{key}", value, hints[key])
 
 
 def options_of(node: Mapping[str, Any]) -> set[str]:
     """Return the options of a call; none if it is not a call or names nothing that exists."""
     with contextlib.suppress(ConfigError, TypeError, ValueError):
-        return _signature(_target("", node.get("_target_"), trust=True))[0]
+        return _signature(_target("", node.get("_target_")))[0]
     return set()
 
 
@@ -312,12 +338,12 @@ def _signature(target: Callable[..., Any]) -> tuple[set[str], dict[str, Any]]:
 
 
 def matches_type(value: Any, hint: Any) -> bool:
-    """Return True if a YAML value matches a type hint; a mapping with `_target_` always does."""
+    """Return True if a YAML value matches a type hint; a call does where it allows an object."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
         return any(matches_type(value, argument) for argument in arguments)
-    if isinstance(value, dict) and "_target_" in value:
-        return True  # another call
+    if _names_target(value):
+        return hint is dict or (origin or hint) not in VALUES
     if origin is Literal:
         return value in arguments
     if origin is tuple and Ellipsis not in arguments:
@@ -325,6 +351,9 @@ def matches_type(value: Any, hint: Any) -> bool:
         return many and all(map(matches_type, value, arguments))
     if origin in (Sequence, Iterable, list, tuple):
         return isinstance(value, list) and all(matches_type(item, arguments[0]) for item in value)
+    if origin in (Mapping, dict):
+        items = value.values() if isinstance(value, dict) else ()
+        return isinstance(value, dict) and all(matches_type(item, arguments[1]) for item in items)
     kind = origin or hint
     kind = {float: (int, float), Path: str, Callable: (), Any: object}.get(kind, kind)
     if hint in (int, float) and isinstance(value, bool):
@@ -342,10 +371,14 @@ def _describe(hint: Any) -> str:
     if origin is Literal:
         return f"one of {', '.join(map(str, arguments))}"
     if origin is Mapping:
-        return "a mapping"
+        return f"a mapping, each {_describe(arguments[1])}"
     if origin is Sequence:
         return f"a list, each {_describe(arguments[0])}"
     return names.get(hint, str(hint))
+
+
+def _names_target(node: Any) -> bool:
+    return isinstance(node, dict) and "_target_" in node
 
 
 def iter_nodes(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:

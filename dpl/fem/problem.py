@@ -132,7 +132,11 @@ class Problem(BodyVariants):
         )
         if isinstance(material, Mapping):
             material = Heterogeneous(material, regions or {})
-        material = material.on(basis, length, origin)
+        try:
+            material = material.on(basis, length, origin)
+        except ValueError as error:
+            is_named = str(error).startswith(("material.", "regions:"))
+            raise ValueError(f"{'' if is_named else 'material.'}{error}") from error
         dN, dV = gradients(basis)
         functions = None
         if mean_dilatation:

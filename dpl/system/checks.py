@@ -1,6 +1,8 @@
-"""Checks of the ranges of arguments."""
+"""Checks of the ranges of arguments, and errors that name an argument."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 def check_range(low: float, high: float = math.inf, /, **values: float) -> None:
@@ -9,3 +11,12 @@ def check_range(low: float, high: float = math.inf, /, **values: float) -> None:
         if not low <= value <= high:
             span = f"lie between {low:,} and {high:,}" if high < math.inf else f"be {low} or more"
             raise ValueError(f"{name} = {value} must {span}")
+
+
+@contextmanager
+def named_errors(place: str) -> Iterator[None]:
+    """Turn errors of values and of files into a ValueError whose message begins with a place."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{place}{error}") from error

@@ -1,16 +1,22 @@
-"""Atomic writes, reading of regular files, JSON lines, and exclusive locks of folders."""
+"""Atomic writes, reading of regular files, arrays, JSON lines, and exclusive locks of folders."""
 
 import fcntl
 import json
+import math
 import os
 import socket
 import stat
 import time
+import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_ARRAY_SIZE = 2**30  # of an array in a file, and of its float64 numbers [bytes]
 MAX_TEXT_SIZE = 2.0**28  # of a text file in a data set [bytes]
 
 
@@ -114,6 +120,56 @@ def _check_regular_file(path: Path, most: float) -> None:
             f"{path} is damaged: its size is {status.st_size:,} bytes, and at most {most:,.0f} are "
             "expected; remove it or choose another data.folder"
         )
+
+
+def read_array(path: Path, row: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the array in a .npy file, or the only one in a .npz file, (S, *row) with S > 0.
+
+    The kind and the size of the file, and type and shape in the header of the array, are checked
+    before the array is read.
+
+    Raises:
+        OSError: The file cannot be opened.
+        ValueError: It is not a regular file, is damaged or too large, or contains anything else.
+    """
+    if path.suffix not in (".npy", ".npz"):
+        raise ValueError("the file must be .npy or .npz")
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise ValueError("the file is a pipe or a device and must be a regular file")
+        if status.st_size > MAX_ARRAY_SIZE:
+            raise ValueError(f"the file must have at most {MAX_ARRAY_SIZE:,} bytes")
+        try:
+            if path.suffix == ".npy":
+                return _read_npy(file, status.st_size, row)
+            with zipfile.ZipFile(file) as archive:
+                if len(members := archive.infolist()) != 1:
+                    raise ValueError(f"the file must contain one array and has {len(members)}")
+                if members[0].compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError("the file must be written by numpy.savez")
+                with archive.open(members[0]) as member:
+                    return _read_npy(member, members[0].file_size, row)
+        except (OSError, ValueError):
+            raise
+        except Exception as error:  # of zipfile, zlib, or the parser of the header
+            raise ValueError(f"the file is damaged: {' '.join(str(error).split())}") from error
+
+
+def _read_npy(file: IO[bytes], size: int, row: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the array (S, *row) of a .npy file of so many bytes."""
+    headers = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = headers[np.lib.format.read_magic(file)[0] == 2](file)
+    count, body = math.prod(shape), size - file.tell()
+    if dtype.kind not in "fiu" or shape[1:] != row or not count > 0:
+        wanted = ", ".join(map(str, row))
+        raise ValueError(f"the array of {dtype} of shape {shape} must be numbers (S, {wanted})")
+    if count * dtype.itemsize != body:
+        raise ValueError(f"the file is damaged: {body:,} bytes for an array of shape {shape}")
+    if 8 * count > MAX_ARRAY_SIZE:
+        raise ValueError(f"the array must have at most {MAX_ARRAY_SIZE // 8:,} numbers")
+    array = np.frombuffer(file.read(body), dtype, count)
+    return array.reshape(shape, order="F" if fortran else "C").astype(np.float64)
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:

@@ -54,7 +54,7 @@ BAD = {  # override -> what the message must name
     "young={low:0,high:1e6}": r"young\.low = 0 must lie between",
     "young={low:abc,high:1e6}": r"young\.low = 'abc' must be a number",
     "young={low:1,high:2,distribution:normal}": r"young\.distribution = 'normal' must be one of",
-    "young={low:1,high:2,_target_:os.system}": r"young\.",
+    "young={low:1,high:2,_target_:os.system}": r"young = .*, not a call$",
     "young=true": r"young = True",
     "mesh.nodes=[5,3]": r"mesh: nodes = \[5, 3\]",
     "mesh.nodes=[5,3,1]": r"mesh: nodes = \[5, 3, 1\]",
@@ -109,6 +109,16 @@ BAD = {  # override -> what the message must name
     "material._target_=3": r"material\._target_ = 3 must be a text",
     "+mesh._args_=[1]": r"mesh\._args_: .* has no such option",
     "solver._partial_=yes_please": r"solver\._partial_ = 'yes_please' must be true or false",
+    "material.poisson={_target_:dpl.fem.CellField,values:[0.1]}": (
+        r"^material\.poisson: values of shape \(1,\) must be 16 finite numbers"
+    ),
+    "material.poisson={_target_:dpl.fem.CellField,values:a,file:nowhere.vtu}": (
+        r"^material\.poisson: nowhere\.vtu: no such mesh file"
+    ),
+    "+forces.muscle={_target_:dpl.fem.ActiveStress,value:1.0,"
+    "directions:{_target_:dpl.fem.FibreData,fibre:f,file:nowhere.vtu}}": (
+        r"^forces\.muscle: directions: nowhere\.vtu: no such mesh file"
+    ),
     "mean_dilatation=1": r"mean_dilatation = 1 must be true or false",
 }
 
@@ -592,17 +602,6 @@ def test_a_run_without_a_checkpoint_is_refused(copied):
 
 
 @pytest.mark.parametrize(
-    "path", ["mesh", "material", "loads.distribution", "model", "optimizer", "data"]
-)
-def test_a_run_that_names_what_is_not_ours_is_not_called(copied, path, tmp_path):
-    cfg = OmegaConf.load(copied / "config.yaml")
-    OmegaConf.update(cfg, f"{path}._target_", "pathlib.Path.touch")
-    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
-    with pytest.raises(ConfigError, match=r"names pathlib\.Path\.touch"):
-        run_folder.load_run(copied)
-
-
-@pytest.mark.parametrize(
     "call",
     [
         {"_target_": "dpl.config.load_run", "folder": "evil", "trust": True},
@@ -629,16 +628,6 @@ def test_a_run_calls_only_what_a_run_is_made_of(copied, call):
         run_folder.load_run(copied)
 
 
-@pytest.mark.parametrize("key", ["trainer", "callbacks.best_weights", "logger.tensorboard"])
-def test_nothing_of_the_trainer_of_a_run_is_called(copied, monkeypatch, key):
-    cfg, called = OmegaConf.load(copied / "config.yaml"), []
-    OmegaConf.update(cfg, key, {"_target_": "pathlib.Path.touch"}, merge=False)
-    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
-    monkeypatch.setattr("pathlib.Path.touch", lambda *given, **_: called.append(given))
-    run_folder.load_run(copied)
-    assert called == []
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -661,16 +650,18 @@ def test_a_run_cannot_reach_out_of_the_package_through_it(copied, name):
         run_folder.load_run(copied)
 
 
-def test_all_that_a_run_of_conf_calls_is_trusted(copied):
+def test_all_that_a_run_of_conf_calls_is_trusted():
     """What is new in conf/ must be put where it may be read back, or a run of it could not be."""
-    parts = ("mesh", "material", "fixed", "loads", "data", "model", "loss", "optimizer")
     seen = set()
-    for path in (path for part in parts for path in (ROOT / "conf" / part).glob("*.yaml")):
-        for _, node in validation.iter_nodes(OmegaConf.to_container(OmegaConf.load(path))):
-            if isinstance(node, dict) and "_target_" in node:
-                assert callable(validation._target("here", node["_target_"], trust=False)), path
-                seen.add(path.parent.name)
-    assert seen >= set(parts), "each part is made by a call"
+    for key in validation.EXPECTED_TYPES:
+        for path in (ROOT / "conf" / key).glob("*.yaml"):
+            cfg = {key: OmegaConf.to_container(OmegaConf.load(path))}
+            for place, node in validation.iter_nodes(cfg):
+                if isinstance(node, dict) and "_target_" in node:
+                    kinds = validation._kinds(place, cfg)
+                    assert callable(validation._target(place, node["_target_"], kinds)), path
+                    seen.add(key)
+    assert seen >= {"mesh", "material", "loads", "model", "trainer", "callbacks", "logger"}
 
 
 BOMB = "\n".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in pairwise("abcdefgh"))
@@ -831,21 +822,6 @@ def test_an_option_of_the_trainer_changes_only_the_machine_of_a_resumed_run(
     assert (longer.trainer.accelerator, longer.trainer.max_epochs) == ("cpu", 7)
     build.check(longer)
     assert resume.check_resumed(longer)["epoch"] == 0
-
-
-def test_a_resumed_run_calls_only_trusted_objects_or_those_of_the_command_line(
-    copied, resumed_config
-):
-    cfg = OmegaConf.load(copied / "config.yaml")
-    cfg.model._target_ = "pathlib.Path.touch"
-    cfg.callbacks.best_weights._target_ = "pathlib.Path.touch"
-    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
-    with pytest.raises(ConfigError, match=r"model names pathlib\.Path\.touch.*repeat the override"):
-        resumed_config(copied)
-    named = ["model._target_=pathlib.Path.touch", "model.width=16"]
-    found = resumed_config(copied, *named)
-    assert found.model == cfg.model
-    assert found.callbacks.best_weights._target_ == "dpl.training.BestWeights"
 
 
 def test_an_experiment_on_the_command_line_is_compared_as_a_whole(trained, resumed_config):

@@ -13,6 +13,7 @@ from dpl.fem import (
     Box,
     CellField,
     ConstantFibres,
+    FibreData,
     FibreFunction,
     FibreReinforced,
     Guccione,
@@ -260,8 +261,22 @@ def test_a_law_whose_cells_are_not_known_says_so():
 
 @pytest.mark.parametrize("values", [[1.0, 2.0], np.full(24, np.nan)])
 def test_a_field_without_a_number_for_each_cell_is_refused(values):
-    with pytest.raises(ValueError, match="must be 24 finite numbers, one for each cell"):
+    with pytest.raises(ValueError, match=r"^material\.young: .* must be 24 finite numbers"):
         Problem.build(grid(), NeoHookeanLn(0.3, CellField(np.asarray(values))))
+
+
+SHORT = replace(FIBRES, directions=FibreData([[1.0, 0.0, 0.0]]))
+MISFITS = {  # key of the part that does not fit the body -> laws
+    "core.poisson": {"core": NeoHookeanLn(CellField([0.3])), "other": NeoHookeanLn(0.3)},
+    "other.directions": {"core": NeoHookeanLn(0.3), "other": SHORT},
+    "directions": SHORT,
+}
+
+
+@pytest.mark.parametrize("key", MISFITS)
+def test_an_error_names_the_part_of_the_law_that_does_not_fit_the_body(key):
+    with pytest.raises(ValueError, match=rf"^material\.{key}: (values|fibre) of shape"):
+        Problem.build(grid(), MISFITS[key], regions=LEFT)
 
 
 def test_a_field_may_be_cell_data_of_a_mesh_file(tmp_path):
@@ -275,7 +290,7 @@ def test_a_field_may_be_cell_data_of_a_mesh_file(tmp_path):
     law = NeoHookeanLn(0.3, CellField("stiffness", file))
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
     np.testing.assert_allclose(problem.material.young[:, 0], stiffness)
-    with pytest.raises(ValueError, match="no cell data 'softness'"):
+    with pytest.raises(ValueError, match=r"^material\.young: .*no cell data 'softness'"):
         Problem.build(mesh, NeoHookeanLn(0.3, CellField("softness", file)))
     for wrong in (lambda: CellField("stiffness"), lambda: CellField([1.0], file)):
         with pytest.raises(ValueError, match="name of cell data if there is a file"):

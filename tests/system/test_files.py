@@ -2,19 +2,24 @@
 
 import errno
 import fcntl
+import io
 import os
 import resource
 import signal
 import socket
 import subprocess
 import sys
+import tracemalloc
+import zipfile
 from contextlib import contextmanager
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dpl import DataSetError
 from dpl.system import files
-from dpl.system.files import append_jsonl, atomic_write, exclusive_lock, read_jsonl
+from dpl.system.files import append_jsonl, atomic_write, exclusive_lock, read_array, read_jsonl
 
 WRITER = """
 import sys, time
@@ -75,6 +80,76 @@ def test_a_file_that_exceeds_the_disk_leaves_nothing(tmp_path):
         write()
     assert full.value.errno == errno.EFBIG
     assert names(tmp_path) == []
+
+
+# ------------------------------------------------------------------ arrays
+
+
+def header(*shape):
+    """Return the header of a .npy file of an array of this shape."""
+    file = io.BytesIO()
+    form = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, form)
+    return file.getvalue()
+
+
+def pack(path, content, kind=zipfile.ZIP_DEFLATED):
+    with zipfile.ZipFile(path, "w", kind) as archive:
+        archive.writestr("array.npy", content)
+
+
+HARMFUL = {  # name of a file -> how it is made, what the message says
+    "pipe.npy": (os.mkfifo, "a regular file"),
+    "pipe.npz": (os.mkfifo, "a regular file"),
+    "zeros.npy": (lambda path: path.symlink_to("/dev/zero"), "a regular file"),
+    "folder.npy": (Path.mkdir, "directory"),
+    "sparse.npy": (lambda path: path.touch() or os.truncate(path, 10**9), "at most 1,000,000"),
+    "empty.npy": (Path.touch, "expected 8 bytes"),
+    "claims.npy": (lambda path: path.write_bytes(header(10**9, 4, 2)), "damaged: 0 bytes"),
+    "claims.npz": (lambda path: pack(path, header(10**9, 4, 2)), "damaged: 0 bytes"),
+    "nested.npy": (
+        lambda path: path.write_bytes(b"\x93NUMPY\1\0\xe8\3" + b"(" * 1000),
+        "is damaged",
+    ),
+    "unfolds.npz": (lambda path: pack(path, header(200_000, 4, 2) + bytes(12_800_000)), "at most"),
+    "other.npz": (lambda path: pack(path, header(1, 4, 2) + bytes(64), zipfile.ZIP_LZMA), "savez"),
+    "none.npz": (lambda path: np.savez(path), "has 0"),
+    "two.npz": (lambda path: np.savez(path, a=np.ones(1), b=np.ones(1)), "has 2"),
+    "damaged.npz": (lambda path: path.write_bytes(b"PK\x03\x04 damaged"), "zip"),
+}
+
+
+@pytest.fixture
+def traced():
+    """Traces the memory of a test."""
+    tracemalloc.start()
+    yield
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", HARMFUL)
+def test_files_that_would_block_or_fill_the_memory_are_refused_before_they_are_read(
+    name, tmp_path, monkeypatch, traced
+):
+    monkeypatch.setattr(files, "MAX_ARRAY_SIZE", 1_000_000)
+    path, (make, message) = tmp_path / name, HARMFUL[name]
+    make(path)
+    tracemalloc.reset_peak()
+    before = tracemalloc.get_traced_memory()[0]
+    with pytest.raises((OSError, ValueError), match=message):
+        read_array(path, (4, 2))
+    assert tracemalloc.get_traced_memory()[1] - before < 500_000
+
+
+@pytest.mark.parametrize("kind", ["whole.npy", "columns.npy", "packed.npz"])
+def test_arrays_are_read_as_numpy_writes_them(kind, tmp_path):
+    array = np.arange(1, 17).reshape(2, 4, 2)
+    given = np.asfortranarray(array, dtype=np.float32) if kind == "columns.npy" else array
+    save = np.savez_compressed if kind == "packed.npz" else np.save
+    save(tmp_path / kind, given)
+    found = read_array(tmp_path / kind, (4, 2))
+    assert found.dtype == np.float64
+    assert np.array_equal(found, array)
 
 
 # ------------------------------------------------------------------ lines

@@ -18,6 +18,7 @@ from dpl.fem.materials.fibre_reinforced import FibreDirections, fibre_frames
 from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin, Region, cells_in
 from dpl.fem.units import Units
+from dpl.system.checks import named_errors
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ class ActiveStress(FollowerLoad):
         if self.directions is None:
             frames = fibre_frames(material, basis.mesh.nelements)
         else:
-            frames = self.directions.on(basis, units.length, origin)
+            with named_errors("directions: "):
+                frames = self.directions.on(basis, units.length, origin)
             frames = frames if frames.ndim == 4 else frames[:, None]
             frames = frames.expand(basis.mesh.nelements, -1, -1, -1)
         # column f; in 2D its part in plane

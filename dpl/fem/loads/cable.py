@@ -14,6 +14,7 @@ from dpl.fem.loads.forces import ROUNDOFF
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import check_range, rounded
 from dpl.fem.problem import Problem
+from dpl.system.checks import named_errors
 
 INWARD = 1e-7  # shift of points on the surface into their cell, over the distance to its centre [-]
 
@@ -74,10 +75,8 @@ class CableLoads(CombinedLoads):
         if not (length > 0).all():
             raise ValueError(f"cables.{number} must not contain the same point twice in a row")
         pulls = np.diff(step / length, axis=0, prepend=0.0, append=0.0)
-        try:
+        with named_errors(f"cables.{number}: "):
             weights = shape_functions(self.problem, points)
-        except ValueError as error:
-            raise ValueError(f"cables.{number}: {error}") from error
         return torch.from_numpy(weights.T @ pulls)
 
     def _points(self, number: int) -> Array:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from dpl.fem.identity import plain
 from dpl.fem.loads.combined import CombinedLoads
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import check_range
+from dpl.system.files import read_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class FileLoads(CombinedLoads):
 
     Attributes:
         path: An array in .npy, or a .npz file with one array: nodal forces (S, N, D) [N] (2D:
-            [N/m]), the nodes in the order of `Problem.points`.
+            [N/m]), 2^27 numbers at most, the nodes in the order of `Problem.points`.
         factor: Smallest and largest factor; None: `deflection` decides, and the unit of the forces
             has no effect.
     """
@@ -51,9 +51,9 @@ class FileLoads(CombinedLoads):
         """Forces of the file, (S, N, D) [N]."""
         try:
             return read_forces(self.path, self.problem.free.numpy())
-        except (OSError, ValueError, EOFError, BadZipFile) as error:
+        except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-            raise ValueError(f"path = {self.path}: {reason}") from error
+            raise ValueError(f"path = {self.path}: {' '.join(str(reason).split())}") from error
 
     @property
     def _unit(self) -> float:
@@ -117,27 +117,14 @@ def read_forces(path: str, free: NDArray[np.bool_]) -> Array:
     """Return the forces of a .npy or .npz file, (S, N, D) [N].
 
     Args:
-        path: The file.
+        path: The file, which need not be trusted, see `dpl.system.files.read_array`.
         free: Free degrees of freedom, (N, D); each force must act on one.
 
     Raises:
         OSError: The file cannot be read.
         ValueError: It does not contain one array of finite forces of this shape.
     """
-    if Path(path).suffix not in (".npy", ".npz"):
-        raise ValueError("the file must be .npy or .npz")
-    found = np.load(path, allow_pickle=False)
-    if not isinstance(found, np.ndarray):
-        with found as arrays:
-            if len(arrays.files) != 1:
-                raise ValueError(f"the file must contain one array and has {len(arrays.files)}")
-            found = arrays[arrays.files[0]]
-    if found.dtype.kind not in "fiu" or found.shape[1:] != free.shape or not len(found):
-        wanted = ", ".join(map(str, free.shape))
-        raise ValueError(
-            f"the array of {found.dtype} of shape {found.shape} must be numbers (S, {wanted})"
-        )
-    forces = found.astype(np.float64)
+    forces = read_array(Path(path), free.shape)
     for number, force in enumerate(forces):
         if not np.isfinite(force).all():
             raise ValueError(f"force {number} must have finite components")

@@ -13,6 +13,7 @@ from torch import Tensor
 from dpl.fem.loads.family import RandomLoads
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import rounded
+from dpl.system.checks import named_errors
 
 FITS = 1e-6  # distance from a family up to which a force belongs to it [-]
 
@@ -73,10 +74,8 @@ class MixtureLoads(RandomLoads):
         """
         members = []
         for name, family in self.families.items():
-            try:
+            with named_errors(f"families.{name}: "):
                 one = family(linear=self.linear, young=self.young, sampling=self.sampling)
-            except ValueError as error:
-                raise ValueError(f"families.{name}: {error}") from error
             if not isinstance(one, RandomLoads):
                 raise TypeError(
                     f"families.{name} gives {type(one).__name__}; it must give a RandomLoads"
@@ -114,10 +113,8 @@ class MixtureLoads(RandomLoads):
         """
         sizes = []
         for name, member in zip(self.names, self.members, strict=True):
-            try:
+            with named_errors(f"families.{name}: "):
                 sizes.append(member.largest_force)
-            except ValueError as error:
-                raise ValueError(f"families.{name}: {error}") from error
         return max(sizes)
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:

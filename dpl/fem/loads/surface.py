@@ -14,6 +14,7 @@ from torch import Tensor
 from dpl.fem.identity import plain
 from dpl.fem.loads.family import RandomLoads
 from dpl.fem.mesh.regions import Region, facets_in
+from dpl.system.checks import named_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +38,8 @@ class SurfaceLoads(RandomLoads):
         problem = self.problem
         if self.region is None:
             return np.asarray(problem.mesh.boundary_facets())
-        try:
+        with named_errors("region = "):
             return facets_in(self.region, problem.mesh, problem.length, problem.origin)
-        except ValueError as error:
-            raise ValueError(f"region = {error}") from error
 
     @cached_property
     def loadable_dofs(self) -> Tensor:

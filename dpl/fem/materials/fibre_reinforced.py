@@ -14,6 +14,7 @@ from dpl.fem.materials.material import Material, Response
 from dpl.fem.materials.parameters import Composed
 from dpl.fem.materials.tensors import green_lagrange
 from dpl.fem.mesh.regions import Origin
+from dpl.system.checks import named_errors
 
 _REST = (torch.zeros(1, 1, dtype=torch.float64),) * 6  # components of no strain
 ORTHONORMAL = 1e-6  # largest entry of Q^T Q - I
@@ -115,7 +116,8 @@ class FibreReinforced(Composed, Material):
         """
         directions, cells = self.directions, basis.mesh.t.shape[1]
         if not isinstance(directions, Tensor):
-            directions = directions.on(basis, length, origin)
+            with named_errors("directions: "):
+                directions = directions.on(basis, length, origin)
         if len(directions) not in (1, cells):
             raise ValueError(
                 f"directions has frames of {len(directions)} cells and must have those of {cells}"

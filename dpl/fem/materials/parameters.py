@@ -12,6 +12,7 @@ from torch import Tensor
 from dpl.fem.materials.cell_field import CellField
 from dpl.fem.mesh.regions import Origin
 from dpl.fem.ranges import ParameterRange, is_range
+from dpl.system.checks import named_errors
 
 if TYPE_CHECKING:
     Constant = Any  # a batch of values goes through the same arithmetic
@@ -65,8 +66,11 @@ class Parametrised:
         Raises:
             ValueError: A field is invalid.
         """
-        values = {name: getattr(self, name) for name in self.ranged}
-        made = {n: v.on(basis, length, origin) for n, v in values.items() if hasattr(v, "on")}
+        made = {}
+        for name in self.ranged:
+            if hasattr(value := getattr(self, name), "on"):
+                with named_errors(f"{name}: "):
+                    made[name] = value.on(basis, length, origin)
         return replace(cast("Any", self), **made) if made else self
 
     def of_cells(self, cells: Tensor) -> Self:
@@ -185,18 +189,21 @@ class Composed(Parametrised):
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
         """See `Parametrised.on`."""
-        return self._changed(lambda part: part.on(basis, length, origin))
+        parts = {}
+        for key, part in self.parts.items():
+            with named_errors(f"{key}."):
+                parts[key] = part.on(basis, length, origin)
+        return self._changed(parts)
 
     def of_cells(self, cells: Tensor) -> Self:
         """See `Parametrised.of_cells`."""
-        return self._changed(lambda part: part.of_cells(cells))
+        return self._changed({key: part.of_cells(cells) for key, part in self.parts.items()})
 
     def centred(self) -> Self:
         """See `Parametrised.centred`."""
-        return self._changed(lambda part: part.centred())
+        return self._changed({key: part.centred() for key, part in self.parts.items()})
 
-    def _changed(self, change: Callable[[Parametrised], Parametrised]) -> Self:
-        parts = {key: change(part) for key, part in self.parts.items()}
+    def _changed(self, parts: Mapping[str, Parametrised]) -> Self:
         same = all(part is self.parts[key] for key, part in parts.items())
         return self if same else self.with_parts(parts)
 
