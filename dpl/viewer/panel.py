@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpl.inference import GraspAnswer
-from dpl.inference.answer import relative
+from dpl.inference.answer import UNRELIABLE, relative
 from dpl.viewer.frames import QUANTITIES, Frame
 from dpl.viewer.renderer import N_BANDS, band_colours
 from dpl.viewer.units import engineering, scaled, unit_of_scale
@@ -18,7 +18,6 @@ ROW = (
     '<span style="font-variant-numeric:tabular-nums;text-align:right;{}">{}</span></div>'
 )
 BOX = '<div style="padding:2px 12px 6px;font-size:13.5px">{}</div>'
-UNRELIABLE = 0.1  # estimated error of a grasp that is reported [-]
 
 
 def result_table(frame: Frame, frame_rate: float, node: int) -> str:
