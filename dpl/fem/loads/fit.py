@@ -37,10 +37,13 @@ def fit(
         return q, residual
     from scipy.optimize import lsq_linear  # its import is not needed for independent shapes
 
-    root, edge = np.sqrt(np.where(inverse > 0, sizes, 0.0))[:, None] * Vt, EDGE * max(-low, high)
-    bounded = lsq_linear(root, root @ q, (low - edge, high + edge), method="bvls").x
-    same = np.linalg.norm(root @ (bounded - q)) <= EDGE * np.linalg.norm(root @ q)
-    return (np.clip(bounded, low, high) if same else q), residual
+    largest = max(-low, high)
+    root = np.sqrt(np.where(inverse > 0, sizes / max(sizes[0], 1e-300), 0.0))[:, None] * Vt
+    wanted, bounds = root @ q / largest, (low / largest - EDGE, high / largest + EDGE)
+    bounded = lsq_linear(root, wanted, bounds, method="bvls", tol=EDGE**2).x
+    if np.linalg.norm(root @ bounded - wanted) > EDGE * np.linalg.norm(wanted):
+        return q, residual
+    return np.clip(largest * bounded, low, high), residual
 
 
 def amplitudes(sizes: Array, low: float, high: float, largest: float) -> Array:
