@@ -239,6 +239,8 @@ def test_a_summary_states_inversion_convergence_stability_and_range():
         "nothing inverted, stability not examined; "
         "the size of the load is out of range by 1.5 times the training's largest"
     )
+    unknown = summarise(good, True, 2e-8, 0.5, math.nan, False)
+    assert unknown.endswith("; the load family cannot recognise its loads")
     column = state_of(1e-9, status=Status.UNSTABLE, pivots=2)
     assert "UNSTABLE (2 negative eigenvalues)" in summarise(column, True, 1e-9, 1.0, 0.0, False)
 
