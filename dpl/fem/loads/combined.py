@@ -121,7 +121,7 @@ class VectorLoads(CombinedLoads):
 
     def sizes_of(self, coefficients: Array) -> Array:
         """Return the norm of a vector (D,), (1,)."""
-        return np.linalg.norm(coefficients, keepdims=True)
+        return np.linalg.norm(coefficients[None], axis=1)
 
     @property
     def unit_deflection(self) -> float:

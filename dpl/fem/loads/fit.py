@@ -37,13 +37,14 @@ def fit(
         return q, residual
     from scipy.optimize import lsq_linear  # its import is not needed for independent shapes
 
-    largest = max(-low, high)
+    largest = max(-low, high) or 1.0
     root = np.sqrt(np.where(inverse > 0, sizes / max(sizes[0], 1e-300), 0.0))[:, None] * Vt
     wanted, bounds = root @ q / largest, (low / largest - EDGE, high / largest + EDGE)
-    bounded = lsq_linear(root, wanted, bounds, method="bvls", tol=EDGE**2).x
-    if np.linalg.norm(root @ bounded - wanted) > EDGE * np.linalg.norm(wanted):
+    if (np.abs(wanted) > 2 * np.abs(root).sum(axis=1)).any():  # no such coefficients reach it
         return q, residual
-    return np.clip(largest * bounded, low, high), residual
+    bounded = lsq_linear(root, wanted, bounds, method="bvls", tol=EDGE**2).x
+    is_same = np.linalg.norm(root @ bounded - wanted) <= EDGE * np.linalg.norm(wanted)
+    return (np.clip(largest * bounded, low, high) if is_same else q), residual
 
 
 def amplitudes(sizes: Array, low: float, high: float, largest: float) -> Array:

@@ -164,9 +164,9 @@ class ModalLoads(SurfaceLoads):
     @cached_property
     def _span(self) -> tuple[float, float]:
         """Smallest and largest q / q_max that can be drawn."""
-        drawn = self.distribution(TESTED), self.amplitude(TESTED)
-        ends = np.outer(*([numbers.min(), numbers.max()] for numbers in drawn))
-        return float(ends.min()), float(ends.max())
+        q, factor = self.distribution(TESTED), self.amplitude(TESTED)
+        ends = [float(a * b) for a in (q.min(), q.max()) for b in (factor.min(), factor.max())]
+        return min(ends), max(ends)
 
     def arrays(self) -> Mapping[str, Tensor]:
         """Return eigenvalues and eigenvectors, see `Modes`."""

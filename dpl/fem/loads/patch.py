@@ -1,6 +1,5 @@
 """Random uniform tractions on random discs of the boundary."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -106,7 +105,7 @@ class PatchLoads(SurfaceLoads, SizedLoads):
 
     def _fit(self, force: Array) -> tuple[float, float]:
         """Return the largest nodal traction [-] and the residual of a force (N, D)."""
-        if not (unit := np.abs(force).max()) > 0:
+        if (unit := np.abs(force).max()) == 0:
             return 0.0, 0.0
         force, (index, others, sizes, free, _) = force / unit, self._loadable
         there, total = force.take(index), np.linalg.norm(force)
@@ -122,9 +121,10 @@ class PatchLoads(SurfaceLoads, SizedLoads):
             parts = _parts(tractions, traction, free)
         largest = np.nanmax(parts)
         model = free * traction[:, None] * self._disc_weights(parts / largest * sizes)
-        rest = there - np.vdot(model, there) / max(np.vdot(model, model), 1e-300) * model
-        distance = math.hypot(np.linalg.norm(rest), np.linalg.norm(force.take(others))) / total
-        return unit * max(largest * np.linalg.norm(traction), norms.max()), distance
+        rest = there - np.vdot(model, there) / np.maximum(np.vdot(model, model), 1e-300) * model
+        size = np.maximum(largest * np.linalg.norm(traction), norms.max())
+        distance = np.hypot(np.linalg.norm(rest), np.linalg.norm(force.take(others))) / total
+        return float(unit * size), float(distance)
 
     def _disc_weights(self, weights: Array) -> Array:
         """Return the sums (n,) of the areas of loaded facets at each node that resemble `weights`.
@@ -137,7 +137,7 @@ class PatchLoads(SurfaceLoads, SizedLoads):
         halves, wanted = low, weights.take(corners)
         unknown = np.isnan(wanted)
         undecided = ~unknown.all(axis=0)
-        loaded = np.zeros(len(undecided))
+        loaded = np.zeros(areas.shape[1])
         for _ in range(MAX_ROUNDS):
             required = undecided & (wanted > high).any(axis=0)
             excluded = undecided & (wanted < low).any(axis=0)
