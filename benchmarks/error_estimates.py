@@ -28,6 +28,7 @@ from dpl.fem import (
     box,
     propeller,
 )
+from dpl.fem.loads.family import MAX_DISTANCE
 from dpl.inference import corotational_error, estimate_error
 from dpl.inference.answer import ROUNDOFF
 from dpl.models import FCNN, Correctable, HasCorrection, PODNet, Unrolled
@@ -266,8 +267,9 @@ def measured(
             u, modes = last.displacement, last.error + newton.outside_error
         error = float((u[0] - exact).norm() / exact.norm())
         corotational, known = corotational_error(scene.linear, load, u), math.inf
-        amplitude, _ = scene.loads.project(load.force)
-        if newton is not None and newton.outside_error > 0 and amplitude < 1 + ROUNDOFF:
+        amplitude, distance = scene.loads.project(load.force)
+        in_range = amplitude < 1 + ROUNDOFF and distance <= MAX_DISTANCE  # False if it is NaN
+        if newton is not None and newton.outside_error > 0 and in_range:
             known = modes
         reported = estimate_error(scene.linear, load, u, in_modes=known).error
         yield Estimate("", "", "", error, corotational, modes, reported)

@@ -1,5 +1,6 @@
 """Answers of the simulator and their summaries in words."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -7,9 +8,10 @@ import numpy as np
 from torch import Tensor
 
 from dpl.fem import Solution, Status
+from dpl.fem.loads.family import MAX_DISTANCE
 
-MAX_OUT_OF_SPAN = 1e-3  # relative projection residual of forces of the load family [-]
 ROUNDOFF = 1e-9  # relative error of amplitudes [-]
+UNRELIABLE = 0.1  # estimated error from which a grasp is reported [-]
 UNKNOWN = 0.995  # estimated error from which the displacement is called unknown [-]
 LEAST_PERCENTAGE = 1e-4  # smallest estimated error that is given in per cent [-]
 
@@ -32,11 +34,11 @@ class Answer:
             this residual. The estimated error has no part in it.
         negative_pivots: Number of negative eigenvalues of the tangent; 1 if there are some, not
             counted; -1: not examined.
-        amplitude: Largest modal load over the largest of the training [-], see
-            `ModalLoads.project`.
-        out_of_span: Norm of the part of the force that is no combination of the modes of the
-            training, over that of the force [-].
-        out_of_distribution: True if the load lies outside the training range.
+        amplitude: Size of the load over the largest of the training [-]; outside of the range of
+            sizes, 1 plus the distance from it over the largest size, see `LoadFamily.project`.
+        out_of_span: Norm of the part of the force that no load of the training explains, over that
+            of the force [-]; NaN if the load family cannot recognise its loads.
+        out_of_distribution: True if the load lies outside the training range, as far as known.
         method: Method that computed the result: "rest", "linear", "network", "corrected",
             "hybrid" or "full Newton".
         iterations: Linear solves with a tangent.
@@ -96,11 +98,12 @@ def summarise(
     if int(state.status) == Status.NO_VALID_EQUILIBRIUM:
         words += f"; no equilibrium found beyond {float(state.load_factor):.2f} of the load"
     if not outside:
-        return words
-    if out_of_span > MAX_OUT_OF_SPAN:
+        return words + "; the load family cannot recognise its loads" * math.isnan(out_of_span)
+    if out_of_span > MAX_DISTANCE:
         return words + f"; {out_of_span:.0%} of the load is unlike the training's"
     if amplitude > 1 + ROUNDOFF:
-        return words + f"; the load is {amplitude:.2g} times the training's largest"
+        off = f"{amplitude - 1:.2g} times the training's largest"
+        return words + f"; the size of the load is out of range by {off}"
     return words + "; a modulus lies outside the training's range"
 
 

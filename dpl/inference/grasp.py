@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dpl.fem import AndersonSolver, Load, Newton, RigidPatch, Solution, evaluate_solution
-from dpl.inference.answer import summarise
+from dpl.inference.answer import UNRELIABLE, summarise
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.error_estimate import estimate_error
 from dpl.inference.grasp_forces import Forces, predicted_forces
@@ -46,9 +46,11 @@ class GraspAnswer:
         volume_ratio: min det F [-]; an element is inverted if it is not above 0.
         converged: True if the motion is met exactly, the residual is below the tolerance and no
             element is inverted.
-        amplitude, out_of_span, out_of_distribution: Position of the forces of the gripper relative
-            to the training, see `Answer`. A rigid patch has concentrated forces along its edge,
-            which most trainings do not contain.
+        amplitude, out_of_span: Position of the forces of the gripper relative to the training, see
+            `Answer`. A rigid patch has concentrated forces along its edge, which most trainings do
+            not contain.
+        out_of_distribution: True if the forces are outside the training range and `error` is not
+            below 10 %.
         method: "network", "corrected", "hybrid" or "full Newton".
         iterations: Predictions of the network and corrections, or linear solves of Newton's method.
         milliseconds: Wall time [ms].
@@ -347,8 +349,9 @@ class Gripper:
         nodal = patch.at(held.force)
         wrench = patch.wrench(nodal, state.displacement[0])
         kept = held.is_exact
-        amplitude, out_of_span, outside = (float(column) for column in place)
-        words = summarise(state, kept, held.error, amplitude, out_of_span, bool(outside))
+        amplitude, out_of_span = float(place.amplitude), float(place.out_of_span)
+        outside = bool(place.outside) and not held.error < UNRELIABLE
+        words = summarise(state, kept, held.error, amplitude, out_of_span, outside)
         if budget.spent:
             words += f"; stopped by the budget of {budget.request.budget_ms:g} ms"
         missed = held.motion_error * scene.length
@@ -364,7 +367,7 @@ class Gripper:
             converged=kept,
             amplitude=amplitude,
             out_of_span=out_of_span,
-            out_of_distribution=bool(outside),
+            out_of_distribution=outside,
             method=held.method,
             iterations=int(state.iterations),
             milliseconds=1e3 * (time.perf_counter() - budget.request.begin),

@@ -423,12 +423,12 @@ class Simulator:
             iterations=taken + state.iterations, from_guess=True, evaluation=state.evaluation,
         )  # fmt: skip
         outside = self.newton.outside_error  # 0 if it is not known
-        is_known = outside > 0 and not place.outside and bool(solution.residual < MAX_RESIDUAL)
+        in_range = bool(place.is_known & ~place.outside & (solution.residual < MAX_RESIDUAL))
         return Candidate(
             "corrected" if taken + state.iterations else "network",
             solution,
             error_in_modes=state.error,
-            error_outside=outside if is_known else math.inf,
+            error_outside=outside if outside > 0 and in_range else math.inf,
             evaluation=state.evaluation,
         )
 

@@ -6,7 +6,8 @@ from typing import NamedTuple, Self
 from torch import Tensor
 
 from dpl.fem import Load
-from dpl.inference.answer import MAX_OUT_OF_SPAN, ROUNDOFF
+from dpl.fem.loads.family import MAX_DISTANCE
+from dpl.inference.answer import ROUNDOFF
 from dpl.training import Surrogate
 
 
@@ -14,9 +15,11 @@ class RangeCheck(NamedTuple):
     """Position of loads relative to the range of the training.
 
     Attributes:
-        amplitude: Largest modal load over the largest of the training, (B,) [-].
-        out_of_span: Relative part of the force outside the modes of the training, (B,) [-].
-        outside: Whether the load is out of range, (B,).
+        amplitude: Size of the load over the largest of the training, above 1 outside of its range,
+            (B,) [-], see `LoadFamily.project`.
+        out_of_span: Relative part of the force that no load of the training explains, (B,) [-]; NaN
+            if the load family cannot recognise its loads.
+        outside: Whether the load is known to be out of range, (B,).
     """
 
     amplitude: Tensor
@@ -27,10 +30,15 @@ class RangeCheck(NamedTuple):
     def of(cls, surrogate: Surrogate, load: Load) -> Self:
         """Return the position of loads relative to the range of a surrogate's scene."""
         amplitude, out_of_span = surrogate.scene.loads.project(load.force)
-        outside = (amplitude > 1 + ROUNDOFF) | (out_of_span > MAX_OUT_OF_SPAN)
+        outside = (amplitude > 1 + ROUNDOFF) | (out_of_span > MAX_DISTANCE)
         for values, (low, high) in _inputs(surrogate, load):
             outside |= (values < low) | (values > high)
         return cls(amplitude, out_of_span, outside)
+
+    @property
+    def is_known(self) -> Tensor:
+        """Whether the load family can tell if the load is in range, (B,)."""
+        return ~self.out_of_span.isnan()
 
     def split(self) -> list[Self]:
         """Return the positions one by one, B = 1."""

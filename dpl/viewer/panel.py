@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpl.inference import GraspAnswer
-from dpl.inference.answer import relative
+from dpl.inference.answer import UNRELIABLE, relative
 from dpl.viewer.frames import QUANTITIES, Frame
 from dpl.viewer.renderer import N_BANDS, band_colours
 from dpl.viewer.units import engineering, scaled, unit_of_scale
@@ -18,7 +18,6 @@ ROW = (
     '<span style="font-variant-numeric:tabular-nums;text-align:right;{}">{}</span></div>'
 )
 BOX = '<div style="padding:2px 12px 6px;font-size:13.5px">{}</div>'
-UNRELIABLE = 0.1  # estimated error of a grasp that is reported [-]
 
 
 def result_table(frame: Frame, frame_rate: float, node: int) -> str:
@@ -30,7 +29,9 @@ def result_table(frame: Frame, frame_rate: float, node: int) -> str:
     assert answer is not None
     colour = GOOD if frame.converged else WARNING if frame.volume_ratio > 0 else BAD
     outside = answer.out_of_distribution
-    span = f"{'outside' if outside else 'inside'}, amplitude {answer.amplitude:.2f}"
+    place = "outside" if outside else "unknown" if np.isnan(answer.out_of_span) else "inside"
+    is_told = frame.grasp is None or outside  # the forces of a good grasp may have any place
+    span = f"{place}, amplitude {answer.amplitude:.2f}"
     rows = [
         *(_load_rows(frame) if frame.grasp is None else _gripper_rows(frame, frame.grasp)),
         _row("displacement at the hand", _length(frame.displacement[node]), "font-weight:600"),
@@ -44,7 +45,7 @@ def result_table(frame: Frame, frame_rate: float, node: int) -> str:
         ),
         _row("min det F", f"{frame.volume_ratio:.3f}"),
         _row("linear solves" if frame.grasp is None else "iterations", f"{answer.iterations}"),
-        _row("training range", span, f"color:{BAD if outside else GOOD}"),
+        *([_row("training range", span, f"color:{BAD if outside else GOOD}")] if is_told else []),
         f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
         f'{colour};background:{colour}14;line-height:1.35">{html.escape(answer.summary)}</div>',
     ]

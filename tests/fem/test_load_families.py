@@ -3,6 +3,7 @@
 import math
 import pickle
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,12 +27,15 @@ from dpl.fem import (
     Plane,
     PointLoads,
     Problem,
+    RandomLoads,
     box,
     rectangle,
     solve,
 )
-from dpl.fem.loads.sampling import direction
+from dpl.fem.loads.forces import traction
+from dpl.fem.loads.sampling import direction, logarithmic
 from dpl.fem.loads.sized import softest_node
+from dpl.inference.training_range import RangeCheck
 
 END = Plane(0, "max")
 CABLE = [
@@ -45,6 +49,21 @@ def body(*, scale=1.0, young=4500.0, nodes=(6, 3, 3)):
     mesh = box([100.0 * scale, 25.0 * scale, 25.0 * scale], nodes)
     problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), young=young)
     return LinearSolver(problem, linear="superlu")
+
+
+class SumLoads(RandomLoads):
+    """Random forces on all nodes of the boundary, which this family does not recognise."""
+
+    largest_force = 1.0
+
+    @property
+    def n_force(self):
+        return int(self.loadable_dofs.sum())
+
+    def force_at(self, point):
+        force = torch.zeros(self.problem.shape, dtype=torch.float64)
+        force[self.loadable_dofs] = torch.from_numpy(point) / len(point) ** 0.5
+        return force
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +92,9 @@ def build(path):
         "cable": partial(CableLoads, cables=CABLE),
         "file": partial(FileLoads, path=path, factor=None),
     }
-    families["mixture"] = partial(MixtureLoads, families=dict(families))
+    families["unrecognised"] = SumLoads
+    members = {name: families[name] for name in FAMILIES[:-1]}
+    families["mixture"] = partial(MixtureLoads, families=members)
 
     def build(name, linear, **options):
         return families[name](linear, young=linear.problem.young or [1e3, 1e5], **options)
@@ -154,6 +175,60 @@ def test_own_loads_are_in_range_and_doubled_ones_are_larger(build, linear, name)
         assert_close(loads.project(2 * force)[0], 2 * amplitude, rtol=1e-9, atol=0)
     zero = loads.project(torch.zeros_like(force[:1]))
     assert [float(one) for one in zero] == [0.0, 0.0]
+
+
+def placed(loads, force):
+    """Return the words of `RangeCheck` for forces (B, N, D)."""
+    surrogate = SimpleNamespace(scene=SimpleNamespace(loads=loads), net=None)
+    load = loads.sample(0, [0] * len(force))._replace(force=force)
+    place = RangeCheck.of(surrogate, load)
+    found = zip(place.outside.tolist(), place.is_known.tolist(), strict=True)
+    return {"out" if outside else "in" if known else "unknown" for outside, known in found}
+
+
+PUSH = partial(FacePressure, region=END, pressure=[10.0, 30.0])
+PULL = partial(CableLoads, cables=CABLE, tension=[1.0, 2.0])
+WHOLE = {"patch_radius": (2.0, 2.0), "distribution": partial(logarithmic, low=0.2)}
+UNSURE = "in/unknown out out/unknown out/unknown out unknown"
+PLACES = [  # own, 3 times the largest, 0.01 times, reversed, on inner nodes, a squeezing pair
+    ("modal", {}, "in out in in out out"),
+    ("modal", WHOLE, "in out out out out out"),
+    ("patch", {}, "in out in in out out"),
+    ("point", {}, "in out in in out in"),
+    ("traction", {}, "in out in in out out"),
+    ("pressure", {}, "in out in out out out"),
+    ("pressure", {"pressure": [10.0, 30.0]}, "in out out out out out"),
+    ("pressure", {"pressure": [-30.0, 30.0]}, "in out in in out out"),
+    ("pressure", {"pressure": [-30.0, -10.0]}, "in out out out out out"),
+    ("gravity", {}, "in out in in out out"),
+    ("gravity", {"density": 1.0, "acceleration": [5.0, 10.0]}, "in out out in out out"),
+    ("cable", {}, "in out in out out out"),
+    ("cable", {"tension": [1.0, 2.0]}, "in out out out out out"),
+    ("file", {}, "in out in out out out"),
+    ("file", {"factor": [0.5, 1.0]}, "in out out out out out"),
+    ("file", {"factor": [-1.0, 1.0]}, "in out in in out out"),
+    ("mixture", {}, "in out in in/out out in"),
+    ("mixture", {"families": {"a": PatchLoads, "b": GravityLoads}}, "in out in in out out"),
+    ("mixture", {"families": {"a": PUSH, "b": PULL}}, "in out out out out out"),
+    ("unrecognised", {}, "unknown out unknown unknown out unknown"),
+    ("mixture", {"families": {"a": PUSH, "b": SumLoads}}, UNSURE),
+]
+
+
+@pytest.mark.parametrize(("name", "options", "truth"), PLACES)
+def test_the_range_check_tells_own_loads_from_others(build, linear, name, options, truth):
+    loads, problem = build(name, linear, **options), linear.problem
+    force = torch.cat([loads.sample(seed, range(20)).force for seed in range(3)])
+    least, x = force.flatten(1).norm(dim=1).min(), problem.points
+    inner, pair = torch.zeros(2, *problem.shape, dtype=torch.float64)
+    inner[~problem.boundary] = (1 + x[~problem.boundary]).sin()
+    for z, size in ((0.0, 1.0), (0.25, -1.0)):
+        pair[(x - x.new_tensor([0.6, 0.125, z])).norm(dim=1).argmin(), 2] = size
+    foreign = [least * one / one.norm() for one in (inner, pair)]
+    largest = force / loads.project(force)[0][:, None, None]
+    cases = force, 3 * largest, 0.01 * force, -force, *(one[None] for one in foreign)
+    for case, expected in zip(cases, truth.split(), strict=True):
+        assert placed(loads, case) == set(expected.split("/"))
 
 
 @pytest.mark.parametrize("name", ["traction", "pressure", "gravity", "cable", "file", "point"])
@@ -312,6 +387,7 @@ def test_the_families_of_the_surface_accept_every_element(cell, degree):
         drawn = loads.sample(0, range(10)).force
         assert drawn.isfinite().all()
         assert (problem.acting(drawn).flatten(1).norm(dim=1) > 0).all()
+        assert placed(loads, drawn) == {"in"}
     assert float(loads.weights.sum()) == pytest.approx(area, rel=1e-12)
     patches = PatchLoads(linear, patch_radius=(10.0, 10.0), region=END)
     assert float(patches.weights_of(int(patches.centres[0]), 10.0).sum()) == pytest.approx(area)
@@ -353,6 +429,39 @@ def test_small_discs_have_the_facets_around_their_centre():
     assert sizes == {1.0, 2.0, 4.0}, "corners, edges and the middle of the end"
     for force in loads.sample(0, range(5)).force:
         assert (linear.problem.points[force.any(dim=1), 0] == 1.0).all()
+
+
+@pytest.mark.parametrize("cell", ["tetra", "hexahedron"])
+def test_patches_are_recognised_between_rollers_also(cell):
+    problem = Problem.build(box([4.0, 1.0, 1.0], [7, 4, 4], cell), NeoHookeanLn(0.3), fixed=END)
+    at_0 = problem.points.numpy() < 1e-9
+    fixed = at_0 | ~problem.free.numpy()  # each of three faces slides along itself
+    linear = LinearSolver(Problem.build(problem.mesh, NeoHookeanLn(0.3), fixed=fixed))
+    loads = PatchLoads(linear)
+    points = loads.points(0, range(200))
+    amplitude, distance = loads.project(loads.loads_at(points).force)
+    assert (distance < 1e-9).all()
+    assert (amplitude <= points[:, 2] * (1 + 1e-9)).all()  # rollers take a part of some
+    assert float((amplitude / points[:, 2]).median()) == pytest.approx(1.0)
+
+
+def test_a_traction_that_is_not_uniform_is_no_patch(linear):
+    loads = PatchLoads(linear)
+    growing = partial(np.multiply, [[[1.0]], [[1.0]], [[0.5]]])
+    force = traction(linear.problem, Plane(2, "max"), lambda x: growing(x[:1]))
+    uniform = traction(linear.problem, Plane(2, "max"), lambda x: growing(np.ones_like(x[:1])))
+    distance = loads.project(torch.stack([uniform, force, -force]))[1]
+    assert distance[0] < 1e-9
+    assert (distance[1:] > 0.1).all()
+
+
+def test_coefficients_that_no_fit_tells_apart_are_in_range_if_some_are(linear):
+    same = [[[0.0, 0.0, 0.0], [40.0, 0.0, 0.0]], [[40.0, 0.0, 0.0], [80.0, 0.0, 0.0]]]
+    both = [[[0.0, 0.0, 0.0], [80.0, 0.0, 0.0]]]  # the sum of these
+    cables = CableLoads(linear, [*same, *both], tension=[1.0, 2.0])
+    assert placed(cables, torch.stack([cables.force_at(one) for one in np.eye(3)])) == {"in"}
+    nodes = ModalLoads(linear, n_modes=5, patch_radius=(0.0, 0.0))  # fewer components than modes
+    assert placed(nodes, nodes.sample(0, range(200)).force) == {"in"}
 
 
 def test_point_forces_act_on_as_many_nodes_as_drawn():

@@ -235,8 +235,11 @@ def test_a_summary_states_inversion_convergence_stability_and_range():
     good = state_of(3.7e-8, status=Status.CONVERGED)
     assert summarise(good, True, 2e-8, 2.5, 0.0, True) == (
         "displacement within about 2.0e-08 (estimated), residual 3.7e-08 of the load (converged), "
-        "nothing inverted, stability not examined; the load is 2.5 times the training's largest"
+        "nothing inverted, stability not examined; "
+        "the size of the load is out of range by 1.5 times the training's largest"
     )
+    unknown = summarise(good, True, 2e-8, 0.5, math.nan, False)
+    assert unknown.endswith("; the load family cannot recognise its loads")
     column = state_of(1e-9, status=Status.UNSTABLE, pivots=2)
     assert "UNSTABLE (2 negative eigenvalues)" in summarise(column, True, 1e-9, 1.0, 0.0, False)
 

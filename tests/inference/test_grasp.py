@@ -401,5 +401,11 @@ def test_invalid_arguments_are_refused_in_one_line(sim, call, words):
     assert "\n" not in str(raised.value)
 
 
-def test_forces_unlike_the_training_are_out_of_distribution(sim):
-    assert sim.grasp(END, [0, 0, 30.0]).out_of_distribution
+@pytest.mark.parametrize("steps", [0, 6])
+def test_a_grasp_is_out_of_distribution_if_its_forces_and_its_error_are(scene, steps):
+    answer = simulator_of(scene, linear_network(scene), steps=steps).grasp(
+        END, [0, 0, 40.0], [1.0, 0, 0]
+    )
+    assert answer.amplitude > 1
+    assert answer.out_of_distribution == (answer.error > 0.1) == (steps == 0)
+    assert ("unlike the training" in answer.summary) == (steps == 0)

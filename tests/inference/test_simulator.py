@@ -246,7 +246,7 @@ def test_how_far_a_load_lies_outside_is_said(scene):
     answer = sim(reach)
     assert answer.out_of_distribution
     assert answer.amplitude == pytest.approx(2.5)
-    assert "2.5 times the training's largest" in answer.summary
+    assert "out of range by 1.5 times the training's largest" in answer.summary
     inner = torch.zeros(scene.problem.shape, dtype=torch.float64)
     inner[~scene.problem.boundary] = 1.0
     inside = sim(inner)

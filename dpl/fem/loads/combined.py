@@ -34,9 +34,14 @@ class CombinedLoads(SizedLoads):
         """Return the coefficients (K,) of a point (n_force,) of the unit cube."""
         return self.size_at(point)
 
-    def amplitude_of(self, coefficients: Array) -> float:
-        """Return the amplitude of coefficients (K,): their largest magnitude."""
-        return float(np.abs(coefficients).max())
+    @property
+    def coefficient_range(self) -> tuple[float, float]:
+        """Smallest and largest coefficient [-]."""
+        return self.sizes
+
+    def sizes_of(self, coefficients: Array) -> Array:
+        """Return the sizes of coefficients (K,), which have the range `sizes`."""
+        return coefficients
 
     @property
     def unit_deflection(self) -> float:
@@ -76,10 +81,10 @@ class CombinedLoads(SizedLoads):
         Args:
             force: (B, N, D) [-].
         """
-        shapes = self._acting_shapes
-        fits = [fit(shapes, own) for own in self.own_force(force).flatten(1).numpy()]
-        amplitudes = [self.amplitude_of(c) / self.largest_size for c, _ in fits]
-        return force.new_tensor(amplitudes), force.new_tensor([rest for _, rest in fits])
+        shapes, span = self._acting_shapes, self.coefficient_range
+        fits = [fit(shapes, own, *span) for own in self.own_force(force).flatten(1).numpy()]
+        largest = [self.amplitudes(self.sizes_of(c)).max() for c, _ in fits]
+        return force.new_tensor(largest), force.new_tensor([rest for _, rest in fits])
 
     @cached_property
     def _acting_shapes(self) -> Array:
@@ -109,9 +114,14 @@ class VectorLoads(CombinedLoads):
         """Return the vector (D,) of a point (D,) of the unit cube."""
         return self.vector_at(point)
 
-    def amplitude_of(self, coefficients: Array) -> float:
-        """Return the amplitude of a vector (D,): its norm."""
-        return float(np.linalg.norm(coefficients))
+    @property
+    def coefficient_range(self) -> tuple[float, float]:
+        """Smallest and largest component of a vector [-]."""
+        return -self.largest_size, self.largest_size
+
+    def sizes_of(self, coefficients: Array) -> Array:
+        """Return the norm of a vector (D,), (1,)."""
+        return np.linalg.norm(coefficients[None], axis=1)
 
     @property
     def unit_deflection(self) -> float:

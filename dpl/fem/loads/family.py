@@ -1,5 +1,6 @@
 """Load families: the interface that the package needs, and a base class for new ones."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
@@ -17,6 +18,8 @@ from dpl.fem.problem import Problem
 from dpl.fem.ranges import ParameterRange
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
+
+MAX_DISTANCE = 1e-3  # distance from a family up to which a force counts as a load of it [-]
 
 
 @runtime_checkable
@@ -87,8 +90,11 @@ class LoadFamily(Protocol):
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return amplitudes (B,) and distances (B,) of forces (B, N, D) [-] from the family.
 
-        The amplitude is relative to the largest load of the family: above 1 the force is larger.
-        The distance is the part of the force that no load of the family explains, in [0, 1].
+        The amplitude is the size over the largest one of the family, at most 1 in the range of the
+        family. Outside of it, it is 1 plus the distance from the range over the largest size, also
+        of a load that is too small or has the opposite sign.
+        The distance is the part of the force that no load of the family explains, in [0, 1]. It is
+        NaN where the family cannot recognise its loads.
         """
         ...
 
@@ -253,9 +259,18 @@ class RandomLoads(LoadFamily):
         return self.problem.acting(own)
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ||f|| / `largest_force`, (B,), and zeros: all forces count as in range."""
-        amplitude = self.own_force(force).flatten(1).norm(dim=1) / self.largest_force
-        return amplitude, torch.zeros_like(amplitude)
+        """Return ||f|| / `largest_force`, (B,), and the part outside `loadable_dofs`, (B,).
+
+        The latter is NaN up to `MAX_DISTANCE`: only a subclass can recognise forces on these.
+
+        Args:
+            force: (B, N, D) [-].
+        """
+        own = self.own_force(force)
+        size = own.flatten(1).norm(dim=1)
+        foreign = torch.where(self.loadable_dofs, 0.0, own).flatten(1).norm(dim=1) / size
+        distance = torch.where(foreign > MAX_DISTANCE, foreign, math.nan)
+        return size / self.largest_force, distance
 
     def arrays(self) -> Mapping[str, Tensor]:
         """Return no arrays."""

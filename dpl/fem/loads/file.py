@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dpl.fem.identity import plain
 from dpl.fem.loads.combined import CombinedLoads
+from dpl.fem.loads.fit import best_fit
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import check_range
 from dpl.system.files import read_array
@@ -95,7 +96,7 @@ class FileLoads(CombinedLoads):
         return float(self.problem.acting(self.shapes).flatten(1).norm(dim=1).max())
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
-        """Return amplitudes (B,) and relative residuals (B,) for the most similar force.
+        """Return amplitudes (B,) and relative residuals (B,) for the force that fits best.
 
         Args:
             force: (B, N, D) [-].
@@ -103,10 +104,13 @@ class FileLoads(CombinedLoads):
         shapes = torch.from_numpy(self._acting_shapes)  # (N D, S)
         own = self.own_force(force).flatten(1)
         products, squares = own @ shapes, shapes.square().sum(dim=0)
-        best = (products.abs() / squares.sqrt()).argmax(dim=1)
-        factors = products.gather(1, best[:, None])[:, 0] / squares[best]
-        rest = (own - factors[:, None] * shapes[:, best].T).norm(dim=1)
-        return factors.abs() / self.largest_size, rest / own.norm(dim=1).clamp(min=1e-300)
+        factors, size = products / squares, own.norm(dim=1).clamp(min=1e-300)
+        cosines = products / squares.sqrt() / size[:, None]
+        amplitude = torch.from_numpy(self.amplitudes(factors.numpy()))
+        apart = (1 - cosines.square()).clamp(min=0.0).sqrt()
+        rows, best = torch.arange(len(own)), best_fit(amplitude.T.numpy(), apart.T.numpy())
+        rest = (own - factors[rows, best][:, None] * shapes[:, best].T).norm(dim=1)
+        return amplitude[rows, best], rest / size
 
     def identity(self) -> dict[str, Any]:
         """Return the options; the file is identified by its forces over the largest component."""

@@ -5,16 +5,22 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 LEAST_SQUARE = 1e-13  # singular value of the normal equations over the largest that counts [-]
+EDGE = 1e-6  # of the largest size: a size that much below its range lies in it, due to rounding [-]
+FITS = 1e-6  # distance from a family up to which a force belongs to it [-]
 
 
-def fit(shapes: Array, force: Array) -> tuple[Array, float]:
+def fit(
+    shapes: Array, force: Array, low: float = -np.inf, high: float = np.inf
+) -> tuple[Array, float]:
     """Return the coefficients (K,) and the relative residual of a least-squares fit.
 
-    Linearly dependent shapes get the smallest coefficients. A zero force has the residual 0.
+    If the shapes are linearly dependent, the coefficients with the smallest norm are returned, or
+    coefficients in [low, high] of the same fit if those are not. A zero force has the residual 0.
 
     Args:
         shapes: Fixed forces, (n, K).
         force: The force, (n,).
+        low, high: Range of the coefficients of a load.
     """
     unit = float(np.abs(force).max(initial=0.0))
     if unit == 0:
@@ -26,4 +32,38 @@ def fit(shapes: Array, force: Array) -> tuple[Array, float]:
     for _ in range(2):  # the second time removes the rounding error of the normal equations
         q = q + Vt.T @ (inverse * (U.T @ (shapes.T @ rest)))
         rest = there - shapes @ q
-    return unit * q, float(np.linalg.norm(rest) / np.linalg.norm(there))
+    q, residual = unit * q, float(np.linalg.norm(rest) / np.linalg.norm(there))
+    if inverse.all() or low <= q.min() <= q.max() <= high:
+        return q, residual
+    from scipy.optimize import lsq_linear  # its import is not needed for independent shapes
+
+    largest = max(-low, high) or 1.0
+    root = np.sqrt(np.where(inverse > 0, sizes / max(sizes[0], 1e-300), 0.0))[:, None] * Vt
+    wanted, bounds = root @ q / largest, (low / largest - EDGE, high / largest + EDGE)
+    if (np.abs(wanted) > 2 * np.abs(root).sum(axis=1)).any():  # no such coefficients reach it
+        return q, residual
+    bounded = lsq_linear(root, wanted, bounds, method="bvls", tol=EDGE**2).x
+    is_same = np.linalg.norm(root @ bounded - wanted) <= EDGE * np.linalg.norm(wanted)
+    return (np.clip(largest * bounded, low, high) if is_same else q), residual
+
+
+def amplitudes(sizes: Array, low: float, high: float, largest: float) -> Array:
+    """Return |size| / largest in the range [low, high], else 1 + distance / largest, of any shape.
+
+    The distance is that from the range. Both are equal above a range that begins at 0.
+    """
+    distance = np.maximum(low - sizes, sizes - high)
+    return np.where(distance > EDGE * largest, 1 + distance / largest, np.abs(sizes) / largest)
+
+
+def best_fit(amplitude: Array, distance: Array) -> NDArray[np.int_]:
+    """Return the numbers (B,) of the best of K fits of B forces.
+
+    It is the fit of the smallest distance, and of the smallest amplitude where several fit.
+
+    Args:
+        amplitude: (K, B).
+        distance: (K, B); NaN, where unknown, is better than any distance that does not fit.
+    """
+    order = np.nan_to_num(distance.clip(min=FITS), nan=2 * FITS)
+    return np.asarray(np.lexsort((amplitude, order), axis=0)[0])

@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from dpl.fem.loads.family import RandomLoads
+from dpl.fem.loads.fit import best_fit
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import rounded
 from dpl.system.checks import named_errors
-
-FITS = 1e-6  # distance from a family up to which a force belongs to it [-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +120,8 @@ class MixtureLoads(RandomLoads):
         """Return amplitudes (B,) and distances (B,) of the family that fits each force best.
 
         It is the one of the smallest distance, and of the smallest amplitude among those to which
-        the force belongs.
+        the force belongs. If it belongs to none, and a family cannot recognise its loads, the
+        distance is NaN.
 
         Args:
             force: (B, N, D) [-].
@@ -130,10 +130,8 @@ class MixtureLoads(RandomLoads):
         fits = [torch.stack(member.project(own), dim=1) for member in self.members]
         pairs = torch.stack(fits)  # (families, B, 2)
         amplitude, distance = pairs.unbind(dim=2)
-        order = np.lexsort((amplitude.numpy(), distance.clamp(min=FITS).numpy()), axis=0)
-        best = torch.from_numpy(order[0])[None, :, None].expand(1, -1, 2)
-        amplitude, distance = pairs.gather(0, best)[0].unbind(dim=1)
-        return amplitude, distance
+        best, columns = best_fit(amplitude.numpy(), distance.numpy()), range(len(own))
+        return amplitude[best, columns], distance[best, columns]
 
     def arrays(self) -> Mapping[str, Tensor]:
         """Return the arrays of all families; their names begin with that of the family."""

@@ -14,11 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.loads.fit import fit
+from dpl.fem.loads.fit import amplitudes, fit
 from dpl.fem.loads.modal_basis import Array, Modes, eigenmodes
 from dpl.fem.loads.sampling import Quantile, constant, symmetric_uniform, uniform01
 from dpl.fem.loads.sized import check_deflection
 from dpl.fem.loads.surface import SurfaceLoads, check_patch_radius
+
+TESTED = np.linspace(0.0, 1 - 2.0**-53, 1001)  # numbers at which distributions are examined
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,7 @@ class ModalLoads(SurfaceLoads):
             )
         super().__post_init__()
         for name, low in (("distribution", -1.0), ("radius", 0.0), ("amplitude", 0.0)):
-            drawn = getattr(self, name)(np.linspace(0.0, 1 - 2.0**-53, 1001))
+            drawn = getattr(self, name)(TESTED)
             if not ((drawn >= low) & (drawn <= 1)).all():
                 raise ValueError(f"{name} draws numbers outside [{low:g}, 1]")
 
@@ -139,7 +141,8 @@ class ModalLoads(SurfaceLoads):
         """Return amplitudes (B,) and relative residuals (B,) of a least-squares fit of Phi q.
 
         The fit is over the nodes on which a force acts, so that the loaded area need not be a ball.
-        The amplitude is max |q / q_max|: above 1 the force is larger than any load of this family.
+        The amplitude is max |q / q_max|: above 1 the force is larger than any load of this family,
+        or, if `distribution` or `amplitude` leave out a part of [-1, 1], lies outside its range.
         The residual ||f - Phi q|| / ||f|| is 0 for loads of this family. `constant_force` and
         forces on fixed degrees of freedom do not count, see `Problem.acting`.
 
@@ -155,8 +158,15 @@ class ModalLoads(SurfaceLoads):
         loaded = np.flatnonzero(reduce(np.logical_or, (force != 0).T))  # faster than `any(axis=1)`
         there = force[loaded].ravel()
         shapes = self.modal_forces.numpy()[loaded]
-        q, residual = fit(shapes.reshape(len(there), shapes.shape[-1]), there)
-        return float(np.abs(q).max()), residual
+        q, residual = fit(shapes.reshape(len(there), shapes.shape[-1]), there, *self._span)
+        return float(amplitudes(q, *self._span, 1.0).max()), residual
+
+    @cached_property
+    def _span(self) -> tuple[float, float]:
+        """Smallest and largest q / q_max that can be drawn."""
+        q, factor = self.distribution(TESTED), self.amplitude(TESTED)
+        ends = [float(a * b) for a in (q.min(), q.max()) for b in (factor.min(), factor.max())]
+        return min(ends), max(ends)
 
     def arrays(self) -> Mapping[str, Tensor]:
         """Return eigenvalues and eigenvectors, see `Modes`."""

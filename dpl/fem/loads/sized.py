@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.loads.family import RandomLoads
+from dpl.fem.loads.fit import amplitudes
 from dpl.fem.loads.sampling import Array, direction
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.units import Units
@@ -82,6 +83,10 @@ class SizedLoads(RandomLoads):
         """Return the sizes of numbers in [0, 1), of the same shape [-]."""
         low, high = self.sizes
         return low + (high - low) * t
+
+    def amplitudes(self, sizes: Array) -> Array:
+        """Return the amplitudes of sizes [-], of the same shape, see `LoadFamily.project`."""
+        return amplitudes(sizes, *self.sizes, self.largest_size)
 
     def vector_at(self, point: Array) -> Array:
         """Return the vector (D,) [-] of a point (D,) of the unit cube: its size and direction."""
