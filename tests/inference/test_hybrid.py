@@ -3,7 +3,6 @@
 The predictions are exact solutions with noise, and predictions that are useless.
 """
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -257,7 +256,7 @@ def test_the_hybrid_that_suits_a_scene_has_its_tolerance(scene, stubs):
         suited = default_hybrid(lambda load: 0 * load.force, scene, tol)
         assert suited.newton.tol == wanted
         assert suited.newton.linear_solver is scene.solver.linear_solver
-        assert (suited.steps is not None) == scene.corrector.corotational
+        assert (suited.steps is not None) == scene.is_compact
 
 
 def test_the_discarded_classic_step_is_counted(scene, loads, stubs):
@@ -457,14 +456,14 @@ def test_it_is_said_what_goes_on_from_a_guess(scene, loads, stubs, rule):
         assert bool(last.from_guess) == guessed
 
 
-@pytest.mark.parametrize("corotational", [False, True])
-def test_anderson_iterations_precede_newton_if_the_corrector_is_corotational(scene, corotational):
-    corrector = replace(scene.solver, corotational=corotational)
-    suited = default_hybrid(lambda load: load.force, SimpleNamespace(corrector=corrector))
-    assert suited.newton is corrector
-    assert (suited.steps is not None) == corotational
-    if corotational:
-        assert suited.steps.newton is corrector
+@pytest.mark.parametrize("compact", [False, True])
+def test_anderson_iterations_precede_newton_on_compact_bodies(scene, compact):
+    body = SimpleNamespace(corrector=scene.solver, is_compact=compact)
+    suited = default_hybrid(lambda load: load.force, body)
+    assert suited.newton is scene.solver
+    assert (suited.steps is not None) == compact
+    if compact:
+        assert suited.steps.newton is scene.solver
 
 
 POOR = {"minus": lambda u: -u, "half": lambda u: 0.5 * u, "too far": lambda u: 1.5 * u}
