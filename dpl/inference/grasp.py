@@ -26,6 +26,8 @@ from dpl.training import Surrogate
 
 CORRECTED = 3e-4  # change of a displacement below which its correction ends, over its norm [-]
 MAX_PATCHES = 2  # patches whose compliance and held body are kept
+LARGEST_MOTION = 1e6  # largest translation over L [-] and rotation [rad]
+LEAST_MOTION = 1e-280  # smaller ones count as zero: their residuals cannot be computed
 EXACT = 1e-12  # error of a motion that counts as met exactly [-]
 
 
@@ -288,16 +290,17 @@ class Gripper:
         lengths = as_numbers("translation", [0.0 if x is None else x for x in moves])
         count = 3 if dim == 3 else 1
         turn = as_numbers("rotation", [0.0] * count if rotation is None else rotation).reshape(-1)
-        if len(turn) != count or not lengths.isfinite().all() or not turn.isfinite().all():
+        motion = torch.cat([lengths / scene.length, turn])
+        if len(turn) != count or not (motion.abs() <= LARGEST_MOTION).all():
             raise ValueError(
                 f"translation = {moves}, rotation = {turn.tolist()} must be {dim} lengths [m] and "
-                f"{count} angles [rad], all finite"
+                f"{count} angles [rad], all finite and at most {LARGEST_MOTION:g} L and rad"
             )
+        motion = motion.where(motion.abs() >= LEAST_MOTION, 0.0)
         directions = [x is not None for x in moves]
         patch = self.patch(region, directions, load.parameters, sliding=sliding)
-        moved = lengths / scene.length
         return patch, lambda part: patch.displacement(
-            (part * moved).tolist(), (part * turn).tolist()
+            (part * motion[:dim]).tolist(), (part * motion[dim:]).tolist()
         )
 
     def patch(

@@ -195,6 +195,26 @@ def test_errors_of_a_linear_network_have_slope_two(scene):
     assert math.log10(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
 
 
+@pytest.mark.parametrize("tol", [None, 1e-6])
+@pytest.mark.parametrize("size", [1e-300, 1e-30, 1e-12])
+def test_a_tiny_motion_has_the_linear_answer_and_a_vanishing_one_that_of_rest(
+    scene, sim, size, tol
+):
+    motion = [[size * x for x in vector] for vector in (TRANSLATION, ROTATION)]
+    found = sim.grasp(END, *motion, tol=tol)
+    patch = RigidPatch.of(scene.linear, END, [True] * 3)
+    arms = scene.problem.points[patch.nodes] - scene.problem.points[patch.nodes].mean(dim=0)
+    translation, rotation = torch.tensor(motion, dtype=torch.float64)
+    goal = (translation / L + torch.linalg.cross(rotation[None], arms)).flatten()
+    goal = goal if size > 1e-280 else 0 * goal
+    force = patch.at(patch.stiffness_times(goal)) * E * L**2
+    moved = L * scene.linear.solve_force(force / (E * L**2)).numpy()
+    assert found.converged
+    assert found.error < 1e-6
+    assert np.allclose(found.displacement, moved, rtol=0, atol=1e-6 * abs(moved).max())
+    assert np.allclose(found.nodal_force, force, rtol=0, atol=1e-5 * float(force.abs().max()))
+
+
 def test_a_poor_network_is_reported_and_corrected(scene, solved):
     poor = simulator_of(scene, lambda load: torch.zeros_like(load.force), steps=0)
     found = poor.grasp(END, TRANSLATION, ROTATION)
@@ -382,6 +402,9 @@ def test_a_body_in_the_plane_turns_by_an_angle(make_scene):
         (lambda sim: sim.grasp(Box([40, 10, 10], [60, 14, 14]), [0, 0, 1.0]), "boundary"),
         (lambda sim: sim.grasp(END, [0, 1.0]), "3 lengths"),
         (lambda sim: sim.grasp(END, [0, math.nan, 0]), "finite"),
+        (lambda sim: sim.grasp(END, [0, 1e12, 0]), r"at most 1e\+06 L"),
+        (lambda sim: sim.grasp(END, [0, 1e300, 0]), r"at most 1e\+06 L"),
+        (lambda sim: sim.grasp(END, [0, 0, 0], [0, -1e300, 0]), "and rad"),
         (lambda sim: sim.grasp(END, [None, None, None]), "hold"),
         (lambda sim: sim.grasp(END, [0, 0, 0], 0.3), "angles"),
         (lambda sim: sim.grasp(END, [0, 0, 0], force=[[1.0]]), "force"),
