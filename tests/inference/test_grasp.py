@@ -197,9 +197,7 @@ def test_errors_of_a_linear_network_have_slope_two(scene):
 
 @pytest.mark.parametrize("tol", [None, 1e-6])
 @pytest.mark.parametrize("size", [1e-300, 1e-30, 1e-12])
-def test_a_tiny_motion_has_the_linear_answer_and_a_vanishing_one_that_of_rest(
-    scene, sim, size, tol
-):
+def test_a_tiny_motion_has_the_linear_answer_and_a_vanishing_one_has_rest(scene, sim, size, tol):
     motion = [[size * x for x in vector] for vector in (TRANSLATION, ROTATION)]
     found = sim.grasp(END, *motion, tol=tol)
     patch = RigidPatch.of(scene.linear, END, [True] * 3)
@@ -213,6 +211,34 @@ def test_a_tiny_motion_has_the_linear_answer_and_a_vanishing_one_that_of_rest(
     assert found.error < 1e-6
     assert np.allclose(found.displacement, moved, rtol=0, atol=1e-6 * abs(moved).max())
     assert np.allclose(found.nodal_force, force, rtol=0, atol=1e-5 * float(force.abs().max()))
+
+
+@pytest.mark.parametrize("region", [END, Box([40, 0, 20], [100, 25, 25])])
+def test_errors_of_force_and_moment_are_seen(scene, region):
+    """Of small to large motions, of an accurate and a poor network, with and without a tolerance.
+
+    No estimate below 10 % is less than a third of the error.
+    """
+    rng, ratios = np.random.default_rng(0), []
+    sims = [
+        simulator_of(scene, predict, steps=steps)
+        for predict, steps in ((None, 0), (linear_network(scene), 0), (linear_network(scene), 6))
+    ]
+    for size in (0.3, 5.0, 20.0):
+        for part in (0.0, 1.0):
+            translation = (size * rng.normal(size=3) * [0.2, 0.6, 0.6]).tolist()
+            rotation = (part * size / 40 * rng.normal(size=3)).tolist()
+            exact = sims[-1].grasp(region, translation, rotation, tol=1e-8)
+            for sim in sims[size > 1 :]:  # the forces of large motions take many exact solutions
+                for tol in (None, 1e-2):
+                    found = sim.grasp(region, translation, rotation, tol=tol)
+                    for name in ("force", "moment"):
+                        true, estimate = getattr(exact, name), getattr(found, f"{name}_error")
+                        off = np.linalg.norm(getattr(found, name) - true) / np.linalg.norm(true)
+                        ratios += [estimate / off] if estimate < 0.1 else []
+    assert len(ratios) > 30
+    assert min(ratios) > 1 / 3
+    assert 0.8 < np.median(ratios) < 1.25
 
 
 def test_a_poor_network_is_reported_and_corrected(scene, solved):
@@ -236,6 +262,7 @@ def test_a_network_that_is_not_finite_does_not_reach_the_answer_unseen(scene, so
     off = np.linalg.norm(found.displacement - solved.displacement)
     assert np.isfinite(found.displacement).all()
     assert found.error > off / np.linalg.norm(solved.displacement) / 3 > 0
+    assert not math.isnan(found.force_error)
     exact = lost.grasp(END, TRANSLATION, ROTATION, tol=1e-9)
     assert exact.converged
     assert np.abs(exact.displacement - solved.displacement).max() < 1e-6 * L
