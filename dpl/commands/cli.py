@@ -38,7 +38,7 @@ def command(
     """Return a decorator that turns a function of a configuration into a command.
 
     All jobs are checked before the first one starts. Invalid input ends the command with one line
-    and status 2, Ctrl-C with status 130.
+    and status 2, Ctrl-C with status 130, SIGTERM with status 143.
 
     Args:
         name: Name of the configuration, which Hydra composes from `NAME.yaml` and the command line.

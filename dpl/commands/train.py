@@ -92,12 +92,13 @@ def _train(cfg: DictConfig) -> float | None:
             config.save_config(cfg, folder)
     try:
         trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path or None, weights_only=True)
-    except SystemExit as leaving:  # Lightning turns Ctrl-C into it
-        if leaving.code == 128 + signal.SIGTERM:
-            raise
+    except SystemExit as leaving:  # Lightning turns Ctrl-C and SIGTERM into it, without the status
         if trainer.is_global_zero and session.begun:
             words = [_script("train"), _run_key(folder), "ckpt_path=last", *session_overrides()]
             print(f"to resume: {' '.join(words)}", file=sys.stderr)
+        terminated = 128 + signal.SIGTERM
+        if trainer.received_sigterm or leaving.code == terminated:
+            sys.exit(terminated)
         raise KeyboardInterrupt from leaving
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         ours = isinstance(error, config.ConfigError | DataSetError | training.Diverged)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dpl.fem import AndersonSolver, Load, Newton, RigidPatch, Solution, evaluate_solution
-from dpl.inference.answer import UNRELIABLE, summarise
+from dpl.inference.answer import UNRELIABLE, relative, summarise
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.error_estimate import estimate_error
 from dpl.inference.grasp_forces import Forces, predicted_forces
@@ -26,6 +26,8 @@ from dpl.training import Surrogate
 
 CORRECTED = 3e-4  # change of a displacement below which its correction ends, over its norm [-]
 MAX_PATCHES = 2  # patches whose compliance and held body are kept
+LARGEST_MOTION = 1e6  # largest translation over L [-] and rotation [rad]
+LEAST_MOTION = 1e-280  # smaller ones count as zero: their residuals cannot be computed
 EXACT = 1e-12  # error of a motion that counts as met exactly [-]
 
 
@@ -43,6 +45,9 @@ class GraspAnswer:
             forces of the gripper count as load.
         error: Estimated relative error of the displacement [-], see `estimate_error`, plus
             `motion_error` over the largest displacement of the body: no bound.
+        force_error, moment_error: Estimated errors of `force` and `moment` over their norms [-],
+            see `wrench_errors`: no bounds. They can be far larger than `error`. Infinite if
+            `error` is; large where symmetry makes a resultant zero.
         volume_ratio: min det F [-]; an element is inverted if it is not above 0.
         converged: True if the motion is met exactly, the residual is below the tolerance and no
             element is inverted.
@@ -68,6 +73,8 @@ class GraspAnswer:
     motion_error: float
     residual: float
     error: float
+    force_error: float
+    moment_error: float
     volume_ratio: float
     converged: bool
     amplitude: float
@@ -103,6 +110,7 @@ class Held(NamedTuple):
         force: Forces of the gripper at held degrees of freedom, (m,) [-].
         motion_error: Largest distance of a held node from its prescribed place [-].
         error: Estimated relative error [-].
+        correction: The correction behind it, (1, N, D) [-]; None if there is none.
     """
 
     method: str
@@ -110,6 +118,7 @@ class Held(NamedTuple):
     force: Tensor
     motion_error: float
     error: float
+    correction: Tensor | None
 
     @property
     def is_exact(self) -> bool:
@@ -139,10 +148,40 @@ def evaluated(
     evaluation = newton.problem.evaluate(u)
     missed = patch.at(goal - patch.of_field(u[0])).norm(dim=1).max()
     largest = u.norm(dim=2).max().clamp(min=1e-300)
-    error = estimate_error(newton.linear_solver, load, u, evaluation).error
+    found = estimate_error(newton.linear_solver, load, u, evaluation)
+    state = state.unstable() if found.is_indefinite else state
     if force is None:
         force = patch.of_field(evaluation.internal[0] - load.force[0])
-    return Held(method, state, force, float(missed), error + float(missed / largest))
+    error = found.error + float(missed / largest)
+    return Held(method, state, force, float(missed), error, found.correction)
+
+
+def wrench_errors(
+    patch: RigidPatch, goal: Tensor, load: Load, newton: Newton, held: Held
+) -> tuple[float, float]:
+    """Return the estimated relative errors of force and moment of the gripper [-].
+
+    The estimates compare them with those of the corrected displacement: the correction behind the
+    estimated error of the displacement is added, and the linear forces that move the patch to its
+    goal. They cost one residual.
+
+    Args:
+        patch, goal, load, newton: See `evaluated`.
+        held: A state.
+    """
+    if held.correction is None:
+        return math.inf, math.inf
+    u = held.state.displacement
+    better = u + held.correction
+    reaction = patch.of_field((newton.problem.evaluate(better).internal - load.force)[0])
+    reaction = reaction + patch.stiffness_times(goal - patch.of_field(u[0]))
+    found, expected = (
+        patch.wrench(patch.at(held.force), u[0]),
+        patch.wrench(patch.at(reaction), better[0]),
+    )
+    sizes = [(float((a - b).norm()), float(a.norm())) for a, b in zip(found, expected, strict=True)]
+    force, moment = (wrong / max(size, 1e-300) if wrong >= 0 else math.inf for wrong, size in sizes)
+    return force, moment
 
 
 def candidates(
@@ -256,10 +295,11 @@ class Gripper:
             if request.tol is not None and not held.is_exact and not budget.over():
                 solved = evaluated(patch, goal, own, newton, next(every))
                 held = min(held, solved, key=lambda one: one.rank)
+            errors = wrench_errors(patch, goal, own, newton, held)
             place = RangeCheck.of(
                 self.surrogate, load._replace(force=load.force + patch.at(held.force))
             )
-        return self._reported(patch, load, held, place, forces, budget)
+        return self._reported(patch, load, held, errors, place, forces, budget)
 
     def _load(self, force: Any, young: Any, parameters: Any) -> Load:
         """Return the other forces on the body as a load, B = 1."""
@@ -290,16 +330,17 @@ class Gripper:
         lengths = as_numbers("translation", [0.0 if x is None else x for x in moves])
         count = 3 if dim == 3 else 1
         turn = as_numbers("rotation", [0.0] * count if rotation is None else rotation).reshape(-1)
-        if len(turn) != count or not lengths.isfinite().all() or not turn.isfinite().all():
+        motion = torch.cat([lengths / scene.length, turn])
+        if len(turn) != count or not (motion.abs() <= LARGEST_MOTION).all():
             raise ValueError(
                 f"translation = {moves}, rotation = {turn.tolist()} must be {dim} lengths [m] and "
-                f"{count} angles [rad], all finite"
+                f"{count} angles [rad], all finite and at most {LARGEST_MOTION:g} L and rad"
             )
+        motion = motion.where(motion.abs() >= LEAST_MOTION, 0.0)
         directions = [x is not None for x in moves]
         patch = self.patch(region, directions, load.parameters, sliding=sliding)
-        moved = lengths / scene.length
         return patch, lambda part: patch.displacement(
-            (part * moved).tolist(), (part * turn).tolist()
+            (part * motion[:dim]).tolist(), (part * motion[dim:]).tolist()
         )
 
     def patch(
@@ -339,6 +380,7 @@ class Gripper:
         patch: RigidPatch,
         load: Load,
         held: Held,
+        wrench_errors: tuple[float, float],
         place: RangeCheck,
         forces: Forces,
         budget: Budget,
@@ -352,6 +394,8 @@ class Gripper:
         amplitude, out_of_span = float(place.amplitude), float(place.out_of_span)
         outside = bool(place.outside) and not held.error < UNRELIABLE
         words = summarise(state, kept, held.error, amplitude, out_of_span, outside)
+        force_error, moment_error = wrench_errors
+        words += f"; force within about {relative(force_error)}, moment {relative(moment_error)}"
         if budget.spent:
             words += f"; stopped by the budget of {budget.request.budget_ms:g} ms"
         missed = held.motion_error * scene.length
@@ -363,6 +407,8 @@ class Gripper:
             motion_error=missed,
             residual=float(state.residual),
             error=held.error,
+            force_error=force_error,
+            moment_error=moment_error,
             volume_ratio=float(state.volume_ratio),
             converged=kept,
             amplitude=amplitude,

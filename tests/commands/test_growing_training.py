@@ -47,6 +47,33 @@ def test_a_run_fits_until_its_end_and_is_resumed_with_more_loads(train, tmp_path
     assert sum(json.loads(line)["loads"] for line in sessions) == 150 + 8 + 4
 
 
+TERMINATING = """
+import signal
+
+import lightning as L
+
+
+class Terminate(L.Callback):
+    def on_train_epoch_start(self, trainer, module):
+        if trainer.current_epoch == 1:
+            signal.raise_signal(signal.SIGTERM)
+"""
+
+
+def test_sigterm_ends_a_growing_training_with_143_and_the_command_that_resumes_it(
+    train, tmp_path, monkeypatch
+):
+    (tmp_path / "terminating.py").write_text(TERMINATING)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    stop = "+callbacks.stop={_target_: terminating.Terminate}"
+    ended = train(*RUN, *MODEL, *SIZES, "data.max_train=100", "data.error=1e-9", stop)
+    assert ended.status == 143, ended.err
+    assert "Traceback" not in ended.err
+    assert "run=run ckpt_path=last" in ended.err
+    weights = checkpoints.read(tmp_path / "run/checkpoints/last.ckpt")
+    assert weights["OfflineData"]["points"][0][0] == 64
+
+
 def test_the_set_of_a_growing_run_serves_a_run_of_given_size(train, tmp_path):
     assert not train(*RUN, *MODEL, *SIZES, "data.max_train=20", "data.error=1e-9").status
     again = train("model=unrolled", "data.train=20", "run=other", "logger=none", *MODEL, *SIZES)

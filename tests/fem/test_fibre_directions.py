@@ -49,14 +49,18 @@ def points_of(mesh: skfem.Mesh, degree: int = 1) -> np.ndarray:
     return basis_of(mesh, degree).global_coordinates().value.reshape(mesh.dim(), -1).T
 
 
-def quarter_cylinder(count: int, cell: str = "hexahedron", scale: float = 1.0) -> skfem.Mesh:
+def quarter_cylinder(
+    count: int, cell: str = "hexahedron", scale: float = 1.0, *, curved: bool = False
+) -> skfem.Mesh:
     """Return a quarter of a thick cylinder along z, with `count` cells through the wall."""
     flat = cell in ("quad", "triangle")
     make, nodes = (rectangle, []) if flat else (box, [3])
     mesh = make([1.0] * (3 - flat), [count + 1, 3 * count + 1, *nodes], cell)
-    radius = INNER + (OUTER - INNER) * mesh.p[0]
-    angle = mesh.p[1] * math.pi / 2
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), *mesh.p[2:]])
+    if curved:
+        mesh = {"tetra": skfem.MeshTet2, "hexahedron": skfem.MeshHex2}[cell].from_mesh(mesh)
+    radius = INNER + (OUTER - INNER) * mesh.doflocs[0]
+    angle = mesh.doflocs[1] * math.pi / 2
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), *mesh.doflocs[2:]])
     mesh = type(mesh)(points, mesh.t)
     surfaces = {
         name: lambda x, r=r: np.abs(np.hypot(*x[:2]) - r) < 0.3 * (OUTER - INNER) / count
@@ -209,6 +213,17 @@ def test_angle_through_a_cylinder_follows_the_logarithm_of_the_radius(cell):
 def test_quadratic_elements_follow_it_more_closely():
     linear, quadratic = (errors(quarter_cylinder(4, "tetra"), degree) for degree in (1, 2))
     assert quadratic[0] < 0.5 * linear[0]
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
+def test_directions_are_of_first_order_on_linear_meshes_and_of_second_on_curved_ones(cell):
+    coarse, fine = (np.array(errors(quarter_cylinder(count, cell))) for count in (2, 4))
+    assert (fine > 0.3 * coarse).all()
+    coarse, fine = (
+        np.array(errors(quarter_cylinder(count, cell, curved=True), 2)) for count in (2, 4)
+    )
+    assert (fine < 0.3 * coarse).all()
+    assert (fine < np.radians(0.3)).all()
 
 
 def test_angles_do_not_depend_on_size_and_place():

@@ -195,6 +195,52 @@ def test_errors_of_a_linear_network_have_slope_two(scene):
     assert math.log10(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
 
 
+@pytest.mark.parametrize("tol", [None, 1e-6])
+@pytest.mark.parametrize("size", [1e-300, 1e-30, 1e-12])
+def test_a_tiny_motion_has_the_linear_answer_and_a_vanishing_one_has_rest(scene, sim, size, tol):
+    motion = [[size * x for x in vector] for vector in (TRANSLATION, ROTATION)]
+    found = sim.grasp(END, *motion, tol=tol)
+    patch = RigidPatch.of(scene.linear, END, [True] * 3)
+    arms = scene.problem.points[patch.nodes] - scene.problem.points[patch.nodes].mean(dim=0)
+    translation, rotation = torch.tensor(motion, dtype=torch.float64)
+    goal = (translation / L + torch.linalg.cross(rotation[None], arms)).flatten()
+    goal = goal if size > 1e-280 else 0 * goal
+    force = patch.at(patch.stiffness_times(goal)) * E * L**2
+    moved = L * scene.linear.solve_force(force / (E * L**2)).numpy()
+    assert found.converged
+    assert found.error < 1e-6
+    assert np.allclose(found.displacement, moved, rtol=0, atol=1e-6 * abs(moved).max())
+    assert np.allclose(found.nodal_force, force, rtol=0, atol=1e-5 * float(force.abs().max()))
+
+
+@pytest.mark.parametrize("region", [END, Box([40, 0, 20], [100, 25, 25])])
+def test_errors_of_force_and_moment_are_seen(scene, region):
+    """Of small to large motions, of an accurate and a poor network, with and without a tolerance.
+
+    No estimate below 10 % is less than a third of the error.
+    """
+    rng, ratios = np.random.default_rng(0), []
+    sims = [
+        simulator_of(scene, predict, steps=steps)
+        for predict, steps in ((None, 0), (linear_network(scene), 0), (linear_network(scene), 6))
+    ]
+    for size in (0.3, 5.0, 20.0):
+        for part in (0.0, 1.0):
+            translation = (size * rng.normal(size=3) * [0.2, 0.6, 0.6]).tolist()
+            rotation = (part * size / 40 * rng.normal(size=3)).tolist()
+            exact = sims[-1].grasp(region, translation, rotation, tol=1e-8)
+            for sim in sims[size > 1 :]:  # the forces of large motions take many exact solutions
+                for tol in (None, 1e-2):
+                    found = sim.grasp(region, translation, rotation, tol=tol)
+                    for name in ("force", "moment"):
+                        true, estimate = getattr(exact, name), getattr(found, f"{name}_error")
+                        off = np.linalg.norm(getattr(found, name) - true) / np.linalg.norm(true)
+                        ratios += [estimate / off] if estimate < 0.1 else []
+    assert len(ratios) > 30
+    assert min(ratios) > 1 / 3
+    assert 0.8 < np.median(ratios) < 1.25
+
+
 def test_a_poor_network_is_reported_and_corrected(scene, solved):
     poor = simulator_of(scene, lambda load: torch.zeros_like(load.force), steps=0)
     found = poor.grasp(END, TRANSLATION, ROTATION)
@@ -216,6 +262,7 @@ def test_a_network_that_is_not_finite_does_not_reach_the_answer_unseen(scene, so
     off = np.linalg.norm(found.displacement - solved.displacement)
     assert np.isfinite(found.displacement).all()
     assert found.error > off / np.linalg.norm(solved.displacement) / 3 > 0
+    assert not math.isnan(found.force_error)
     exact = lost.grasp(END, TRANSLATION, ROTATION, tol=1e-9)
     assert exact.converged
     assert np.abs(exact.displacement - solved.displacement).max() < 1e-6 * L
@@ -382,6 +429,9 @@ def test_a_body_in_the_plane_turns_by_an_angle(make_scene):
         (lambda sim: sim.grasp(Box([40, 10, 10], [60, 14, 14]), [0, 0, 1.0]), "boundary"),
         (lambda sim: sim.grasp(END, [0, 1.0]), "3 lengths"),
         (lambda sim: sim.grasp(END, [0, math.nan, 0]), "finite"),
+        (lambda sim: sim.grasp(END, [0, 1e12, 0]), r"at most 1e\+06 L"),
+        (lambda sim: sim.grasp(END, [0, 1e300, 0]), r"at most 1e\+06 L"),
+        (lambda sim: sim.grasp(END, [0, 0, 0], [0, -1e300, 0]), "and rad"),
         (lambda sim: sim.grasp(END, [None, None, None]), "hold"),
         (lambda sim: sim.grasp(END, [0, 0, 0], 0.3), "angles"),
         (lambda sim: sim.grasp(END, [0, 0, 0], force=[[1.0]]), "force"),

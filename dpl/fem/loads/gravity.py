@@ -18,6 +18,8 @@ from dpl.fem.loads.sized import check_largest, check_range
 class GravityLoads(VectorLoads):
     """Weight of the body in random directions, with accelerations of random size.
 
+    The nodal forces are consistent: at corners of quadratic tetrahedra they act against gravity.
+
     The point of a load has the size and the direction, then Young's modulus and, where the law has
     ranges, its parameters.
 
@@ -51,5 +53,8 @@ class GravityLoads(VectorLoads):
 
     @cached_property
     def weights(self) -> Tensor:
-        """Integral of each shape function over the body, (N,) [-]."""
+        """Integral of each shape function over the body, (N,) [-].
+
+        Integrals at corners of quadratic tetrahedra are negative: no masses of the nodes.
+        """
         return body_force(self.problem, np.ones_like)[:, 0].contiguous()

@@ -114,8 +114,13 @@ class RigidPatch:
         arms = points - points.mean(dim=0)
         dim = points.shape[1]
         vector = rotation if dim == 3 else [0.0, 0.0, *rotation]
-        matrix = torch.from_numpy(Rotation.from_rotvec(vector).as_matrix()[:dim, :dim])
-        moved = arms @ matrix.T - arms + torch.tensor(translation, dtype=torch.float64)
+        quaternion = torch.from_numpy(Rotation.from_rotvec(vector).as_quat())
+        axis, cosine = quaternion[None, :3], quaternion[3]
+        arms = torch.nn.functional.pad(arms, (0, 3 - dim))
+        # (R - I) r without the rounding of R, which exceeds a small rotation
+        across = torch.linalg.cross(axis, arms)
+        turned = 2 * (cosine * across + torch.linalg.cross(axis, across))
+        moved = turned[:, :dim] + torch.tensor(translation, dtype=torch.float64)
         return moved[self.held[self.nodes]]
 
     def at(self, values: Tensor) -> Tensor:
