@@ -21,7 +21,7 @@ from dpl.system.files import DataSetError
 def parts(cfg: DictConfig) -> tuple["dpl.Scene", Any, "dpl.Surrogate", Any]:
     """Return scene, data, surrogate and trainer of a run without solving or writing."""
     resumed = config.check_resumed(cfg)
-    scene = config.build_scene(config.with_mesh_of_resumed(cfg))
+    scene = config.build_scene(config.with_files_of_resumed(cfg))
     data = config.instantiate(cfg, "data", scene=scene)
     surrogate = config.build_surrogate(cfg, scene)
     _check_data(surrogate, data)

@@ -833,6 +833,30 @@ def test_an_option_of_the_trainer_changes_only_the_machine_of_a_resumed_run(
     assert resume.check_resumed(longer)["epoch"] == 0
 
 
+@pytest.mark.parametrize(
+    ("named", "used"),
+    [
+        (None, None),
+        ("{elsewhere}", "{run}/data"),
+        ("{run}/more/data", "{run}/more/data"),
+        ("{run}/../{run_name}2", "{run}/data"),
+        ("{data}", "{data}"),  # which is there
+    ],
+)
+def test_a_run_makes_its_data_set_in_its_folder_or_where_the_command_line_says(
+    copied, trained, resumed_config, tmp_path, named, used
+):
+    places = {"elsewhere": tmp_path / "elsewhere", "run": copied, "data": trained[0] / "data"}
+    named, used = (one and one.format(**places, run_name=copied.name) for one in (named, used))
+    cfg = OmegaConf.load(copied / "config.yaml")
+    cfg.data.folder = named
+    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    assert run_folder.load_run(copied)[0].data.folder == used
+    assert resumed_config(copied).data.folder == used
+    assert run_folder.load_run(copied, trust=True)[0].data.folder == named
+    assert resumed_config(copied, "data.folder=here").data.folder == "here"
+
+
 def test_a_resumed_run_calls_only_trusted_objects_or_those_of_the_command_line(
     copied, resumed_config
 ):

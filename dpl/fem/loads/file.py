@@ -33,7 +33,7 @@ class FileLoads(CombinedLoads):
     """
 
     si_options: ClassVar[tuple[str, ...]] = ("path", "factor")
-    path: str
+    path: str | Path
     factor: Sequence[float] | None = (0.0, 1.0)
 
     def __post_init__(self) -> None:
