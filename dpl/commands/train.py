@@ -111,7 +111,10 @@ def _train(cfg: DictConfig) -> float | None:
         torch.distributed.destroy_process_group()
     if not trainer.is_global_zero or trainer.fast_dev_run:
         return None
-    _, best = config.load_run(folder, trust=True, scene=scene)
+    try:
+        _, best = config.load_run(folder, trust=True, scene=scene)
+    except config.ConfigError as error:  # its weights or answers are not finite
+        raise training.Diverged(f"training has diverged: {error}; lower optimizer.lr") from error
     rows = evaluation.evaluate(best, config.load_data(cfg, scene).samples("test"), folder)
     prediction = next(row for row in rows if row.solver == evaluation.PREDICTION)
     if not math.isfinite(prediction.errors["e_mean"]):

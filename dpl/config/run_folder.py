@@ -36,6 +36,9 @@ from dpl.system.memory import at_most
 
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
 MAX_BYTES = 100_000  # of the configuration of a run
+UNUSABLE = (  # errors of a damaged checkpoint
+    *(OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, ArithmeticError),
+)
 
 
 def with_copied_files(
@@ -140,25 +143,27 @@ def load_run(
     check(cfg, trust=trust)
     if not trust:
         cfg = with_own_data(cfg, Path(folder))
-    with _usable(best):
+    with usable(best):
         checkpoint = checkpoints.read(best)
         points = checkpoint.get("OfflineData", {}).get("points")
         if points and OmegaConf.select(cfg, "data.train") == "auto":
             cfg.data.train = int(points[-1][0])
     scene = _scene_of_run(cfg, best, checkpoint, scene, trust=trust)
     surrogate = build_surrogate(cfg, scene)
-    with _usable(best):
+    with usable(best):
         surrogate.on_load_checkpoint(checkpoint)
         surrogate.load_state_dict(checkpoint["state_dict"])
-    return cfg, surrogate.eval()
+        surrogate.eval().check_predictions()
+    return cfg, surrogate
 
 
 @contextlib.contextmanager
-def _usable(checkpoint: Path) -> Iterator[None]:
+def usable(checkpoint: str | Path) -> Iterator[None]:
+    """Turn the errors of a damaged checkpoint into a `ConfigError` that names it."""
     try:
         yield
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except UNUSABLE as error:
+        reason = " ".join(str(error).split()[:60]) or type(error).__name__
         raise ConfigError(f"{checkpoint} cannot be used: {reason}") from error
 
 

@@ -1,11 +1,13 @@
 """Choice of the modes and cells of Newton's method that follows a fitted reduced model."""
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, Problem, SubspaceNewton
+from dpl.fem import LinearSolver, Load, Problem, SubspaceNewton
 from dpl.scene import Sample
 
 RANKS = (60, 160)  # numbers of modes that are tried, and all modes
@@ -15,6 +17,7 @@ TOLERANCE = 3e-2  # of the reduced forces of these cells [-]
 MAX_STEPS = 6  # also of the simulator, whose remaining error this is
 LOADS = 50  # held-out loads by whose errors the number of modes is chosen
 SUFFICIENT = 2e-3  # largest relative error of these loads for which no more modes are tried [-]
+RTOL = 1e-2  # relative residual of iterative solves for an estimate [-]
 ERROR = 1e-5  # estimated relative error at which the steps end [-]
 
 
@@ -50,6 +53,32 @@ def choose_newton(
             break
     assert best is not None
     return best
+
+
+def remaining_error(
+    solver: SubspaceNewton, linear: LinearSolver, loads: Load, guesses: Tensor
+) -> float:
+    """Return the largest relative error that the steps leave [-], as a correction estimates it.
+
+    The correction is that of K(0) in the rotated frames of the nodes. The error is infinite where
+    an element is inverted.
+
+    Args:
+        solver: Newton's method in the modes.
+        linear: Linear solver of the body.
+        loads: The loads, (S, N, D).
+        guesses: Their predictions, (S, N, D).
+    """
+    errors = []
+    for load, guess in zip(loads.unbatch(), guesses, strict=True):
+        u, problem = _last(solver, load, guess), solver.problem.with_parameters(load.parameters)
+        internal, volume = problem.evaluate(u[None])
+        right = problem.restrict(load.force[0] - internal[0])
+        if not volume > 0 or not np.isfinite(right).all():
+            return math.inf
+        correction = linear.reference.corotational.at(u[None]).solve(right, RTOL)
+        errors.append(float(np.linalg.norm(correction) / u.norm().clamp(min=1e-300)))
+    return max(errors)
 
 
 def _after(solver: SubspaceNewton, samples: Sample, guesses: Tensor) -> Tensor:

@@ -697,6 +697,25 @@ def test_a_configuration_that_no_run_writes_is_refused_by_name(copied, text, rep
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "change", "reported"),
+    [
+        ("net.stages.0.weight", lambda w: w[1:], r"size mismatch for net\.stages\.0\.weight"),
+        ("net.stages.0.weight", lambda w: w.long(), r"net\.stages\.0\.weight of torch\.int64 must"),
+        ("net.stages.0.weight", lambda w: w / 0, r"net\.stages\.0\.weight must be finite"),
+        ("net.stages.0.weight", lambda w: w + 1e38, "the answers of the network are not finite"),
+        ("force_scale", lambda w: -w, r"force_scale = -\S+ must be above 0"),
+    ],
+)
+def test_damaged_weights_are_refused_by_name(copied, name, change, reported):
+    best = copied / "checkpoints" / "best.safetensors"
+    checkpoint = checkpoints.read(best)
+    checkpoint["state_dict"][name] = change(checkpoint["state_dict"][name])
+    checkpoints.write(checkpoint, best)
+    with pytest.raises(ConfigError, match=rf"best\.safetensors cannot be used: .*{reported}"):
+        run_folder.load_run(copied)
+
+
 @pytest.mark.parametrize("harm", ["truncated", "text", "no weights", "no scene"])
 def test_a_damaged_checkpoint_is_refused_by_name(copied, harm):
     best = copied / "checkpoints" / "best.safetensors"
