@@ -113,7 +113,7 @@ class FileLoads(CombinedLoads):
         return super().identity() | {"forces": plain(self.shapes)}
 
 
-def read_forces(path: str, free: NDArray[np.bool_]) -> Array:
+def read_forces(path: str | Path, free: NDArray[np.bool_]) -> Array:
     """Return the forces of a .npy or .npz file, (S, N, D) [N].
 
     Args:
