@@ -1,7 +1,6 @@
 """Table and figure of `benchmarks.error_estimates`."""
 
 from collections.abc import Sequence
-from dataclasses import astuple
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -11,16 +10,14 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.error_estimates import IN_RANGE, TWICE, Estimate, Row
+from benchmarks.error_estimates import EXACT, Estimate, Row
 from dpl.visualization import COLOURS, DPI, STYLE
 
 WIDTH = 100  # of the table [characters]
-BAND = (0.5, 2.0)  # ratios that the figure marks [-]
-ESTIMATORS = {"corotational": "corotational correction", "modes": "correction in the modes"}
-SHORT = {IN_RANGE: "in range", TWICE: "twice"}
+BAND = (1 / 3, 3.0)  # ratios that the figure marks [-]
 CAPTION = (
-    "Estimated over true error, 5 %, 50 % and 95 % of the loads; C: corotational correction, "
-    "M: correction in the modes, S: error of the simulator, inf: loads with an infinite one."
+    "Estimated over true error of all answers: 5, 50 and 95 %; least: of answers that say less "
+    "than 10 %; missed: those below a third; inf: answers with an infinite estimate."
 )
 
 
@@ -28,17 +25,20 @@ def show(rows: Sequence[Row]) -> None:
     """Print the quantiles of all rows as one table."""
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0), caption=CAPTION, caption_justify="left")
     table.add_column("", no_wrap=True)
-    shares = [f"{estimator} {share}" for estimator in "CMS" for share in ("5", "50", "95")]
-    for name in ("error", *shares, "inf"):
+    for name in ("answers", "error", "5 %", "50 %", "95 %", "least", "missed", "inf"):
         table.add_column(name, justify="right", no_wrap=True)
     for (body, loads), group in groupby(rows, key=lambda row: (row.body, row.loads)):
         table.add_section()
-        table.add_row(f"[bold]{body}, {SHORT[loads]}[/]")
+        table.add_row(f"[bold]{body}, {loads}[/]")
         for row in group:
-            ratios = astuple(row)[-len(shares) :]
-            cells = ["" if np.isnan(value) else _short(value) for value in ratios]
-            table.add_row(row.prediction, f"{row.error:.0e}", *cells, f"{row.unknown or ''}")
+            ratios = [
+                "" if np.isnan(x) else _short(x) for x in (row.p5, row.median, row.p95, row.least)
+            ]
+            counts = [f"{count or ''}" for count in (row.missed, row.unknown)]
+            table.add_row(row.prediction, f"{row.count}", f"{row.error:.0e}", *ratios, *counts)
     Console(width=WIDTH).print(table)
+    said = sum(row.count for row in rows)
+    print(f"{said} answers, {sum(row.missed for row in rows)} of them missed")
 
 
 def _short(ratio: float) -> str:
@@ -62,7 +62,7 @@ def draw(found: Sequence[Estimate], path: Path) -> None:
             ax.set_title(body)
         axes[0].set_ylabel("estimated / true error")
         handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(4, 2 * len(bodies)))
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(5, 2 * len(bodies)))
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=DPI)
 
@@ -70,18 +70,11 @@ def draw(found: Sequence[Estimate], path: Path) -> None:
 def _draw_body(ax: Any, found: Sequence[Estimate]) -> None:
     ax.axhspan(*BAND, color="0.93", lw=0)
     ax.axhline(1.0, color="0.5", lw=0.7)
-    for k, (name, title) in enumerate(ESTIMATORS.items()):
-        for loads, filled in ((IN_RANGE, True), (TWICE, False)):
-            own = [one for one in found if one.loads == loads]
-            errors = np.array([one.error for one in own])
-            ratios = np.array([getattr(one, name) for one in own]) / errors
-            if np.isnan(ratios).all():
-                continue  # no model has modes
-            face = COLOURS[k] if filled else "none"
-            ax.plot(
-                errors, ratios, "o", ms=2.8, mfc=face, mec=COLOURS[k], mew=0.5, alpha=0.6,
-                label=f"{title}, {loads}",
-            )  # fmt: skip
+    for k, loads in enumerate(dict.fromkeys(one.loads for one in found)):
+        own = [one for one in found if one.loads == loads and one.error > EXACT]
+        errors = np.array([one.error for one in own])
+        ratios = np.array([one.estimated for one in own]) / errors
+        ax.plot(errors, ratios, "o", ms=2.4, color=COLOURS[k], mew=0, alpha=0.5, label=loads)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_xlabel("true relative error")

@@ -15,7 +15,6 @@ from torch import Tensor
 from benchmarks.ablation import solved
 from dpl import Sample, Scene
 from dpl.data import OfflineData
-from dpl.evaluation.timing import latency
 from dpl.fem import (
     Load,
     ModalLoads,
@@ -23,28 +22,28 @@ from dpl.fem import (
     Newton,
     Plane,
     Problem,
-    SubspaceNewton,
     Tag,
     box,
     propeller,
+    solve,
 )
-from dpl.fem.loads.family import MAX_DISTANCE
-from dpl.inference import corotational_error, estimate_error
-from dpl.inference.answer import ROUNDOFF
-from dpl.models import FCNN, Correctable, HasCorrection, PODNet, Unrolled
-from dpl.models.newton_choice import MAX_STEPS
-from dpl.system.threads import one_thread
+from dpl.inference import Simulator
+from dpl.models import FCNN, PODNet, Unrolled
 from dpl.training import MSE, Muon, RMSELoss, Surrogate
 
-Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
 IN_RANGE, TWICE = "in range", "twice the range"
-STEPPED = " + steps"  # end of the name of a prediction that is corrected in modes
-STEP_TOL = 1e-3  # estimated error within the modes at which the steps end [-]
+CALLS: Mapping[str, Mapping[str, float]] = {
+    "": {},
+    "error=1e-2": {"error": 1e-2},
+    "error=1e-3": {"error": 1e-3},
+    "tol=1e-3": {"tol": 1e-3},
+    "tol=1e-6": {"tol": 1e-6},
+}
 MODES = 60  # of the correction of `pod`
-CUBATURE_TOL = 1e-2  # of its cells [-]
-ESTIMATORS = ("corotational", "modes", "reported")
-REPEATS = 5  # timed calls with each load
 SHARES = (0.05, 0.5, 0.95)  # quantiles of the ratio
+SAID = 0.1  # estimated error below which an answer must not be too good [-]
+LEAST = 1 / 3  # ratio of estimated and true error below which it is [-]
+EXACT = 1e-9  # true error that rounding decides [-]
 
 
 @dataclass(frozen=True)
@@ -64,38 +63,36 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Estimate:
-    """True and estimated relative error of a prediction under one load.
+    """True and estimated relative error of an answer of the simulator.
 
     Attributes:
-        body, prediction, loads: Names of the body, the prediction and the set of loads.
+        body, prediction, loads, call: Names of the body, the model, the set of loads and the call.
+        method: Method that computed the answer.
         error: ||u - v|| / ||v|| with the solution v [-].
-        corotational: Estimate by `dpl.inference.corotational_error` [-].
-        modes: Estimate by Newton's correction in the modes of the model, plus the error outside of
-            them [-]; NaN without modes.
-        reported: `error` of the simulator, see `dpl.inference.estimate_error` [-].
+        estimated: `error` of the answer [-].
     """
 
     body: str
     prediction: str
     loads: str
+    call: str
+    method: str
     error: float
-    corotational: float
-    modes: float
-    reported: float
+    estimated: float
 
 
 @dataclass(frozen=True)
 class Row:
-    """Distribution of the ratio of estimated and true error over the loads of a set.
+    """Distribution of the ratio of estimated and true error over the answers of a group.
 
     Attributes:
         body, prediction, loads: See `Estimate`.
-        count: Number of loads.
-        unknown: Number of loads with an infinite estimate, which the quantiles leave out.
+        count: Number of answers.
+        unknown: Number of answers with an infinite estimate, which the quantiles leave out.
         error: Median of the true relative error [-].
-        corotational_p5, corotational_median, corotational_p95: Quantiles of the ratio [-].
-        modes_p5, modes_median, modes_p95: The same of the estimate in the modes [-]; NaN without.
-        reported_p5, reported_median, reported_p95: The same of the `error` of the simulator [-].
+        p5, median, p95: Quantiles of the ratio [-].
+        least: Smallest ratio of an answer whose estimate is below `SAID` [-]; NaN without any.
+        missed: Number of these answers whose ratio is below `LEAST`.
     """
 
     body: str
@@ -104,20 +101,21 @@ class Row:
     count: int
     unknown: int
     error: float
-    corotational_p5: float
-    corotational_median: float
-    corotational_p95: float
-    modes_p5: float
-    modes_median: float
-    modes_p95: float
-    reported_p5: float
-    reported_median: float
-    reported_p95: float
+    p5: float
+    median: float
+    p95: float
+    least: float
+    missed: int
 
 
 def beam() -> Scene:
     """Return the default beam."""
     return _scene(Problem.build(box([100.0, 25.0, 25.0], [17, 5, 5]), NeoHookeanLn(0.3), fixed=END))
+
+
+def column() -> Scene:
+    """Return a column, ten times as long as thick."""
+    return _scene(Problem.build(box([100.0, 10.0, 10.0], [25, 4, 4]), NeoHookeanLn(0.3), fixed=END))
 
 
 def propeller_scene() -> Scene:
@@ -144,6 +142,7 @@ def plate() -> Scene:
 END = Plane(0, "min")
 BODIES: Mapping[str, Callable[[], Scene]] = {
     "beam": beam,
+    "column": column,
     "propeller": propeller_scene,
     "bracket": bracket,
     "plate": plate,
@@ -156,16 +155,6 @@ def _scene(problem: Problem, *, n_modes: int = 5, deflection: float = 0.4) -> Sc
     return Scene(problem, loads, newton)
 
 
-def cost(scene: Scene, samples: Sample) -> str:
-    """Return the times of a corotational estimate and of a residual on one thread as a line."""
-    pairs = list(zip(samples.load.unbatch(), samples.displacement.split(1), strict=True))
-    problem, solver = scene.problem, scene.linear
-    known = [(load, u, problem.evaluate(u)) for load, u in pairs]
-    estimate = latency(lambda one: corotational_error(solver, *one), known, repeats=REPEATS)
-    residual = latency(lambda one: problem.evaluate(one[1]), known, repeats=REPEATS)
-    return f"estimate {estimate.p50:.2f} ms, residual {residual.p50:.2f} ms"
-
-
 def solved_data(scene: Scene, sizes: Sizes, folder: Path) -> OfflineData:
     """Return the data set of a scene in a folder; missing loads are solved."""
     data = OfflineData(
@@ -175,34 +164,113 @@ def solved_data(scene: Scene, sizes: Sizes, folder: Path) -> OfflineData:
     return data
 
 
+def first(samples: Sample, count: int) -> Sample:
+    """Return the first samples."""
+    return Sample(*(column[:count] for column in samples))
+
+
+def softened(scene: Scene, count: int, seed: int = 0) -> dict[str, Sample]:
+    """Return solved loads that may soften the body, by name: compressed, twisted and pinched.
+
+    The forces on the face of largest x act against x, about x, or squeeze the outer half along z.
+    Axial forces are 0.3 to 0.98 times the critical one; the others deflect the body linearly by
+    0.04 to 0.4 L. A force across, of random direction, deflects it linearly by 4e-6 to 0.04 L.
+    Loads without a stable solution are left out.
+
+    Args:
+        scene: The scene.
+        count: Number of loads of each kind.
+        seed: Of the random numbers.
+    """
+    problem, rng = scene.problem, np.random.default_rng(seed)
+    points = problem.points
+    middle = (points.amin(0) + points.amax(0)) / 2
+    end, outer = points[:, 0] > points[:, 0].max() - 1e-9, points[:, 0] > middle[0]
+    upper, lower = (outer & (sign * (points[:, 2] - middle[2]) > 0) for sign in (1, -1))
+    arms = points - middle
+    zero = torch.zeros(problem.shape, dtype=torch.float64)
+    axial, twist, pinch = zero.clone(), zero.clone(), zero.clone()
+    axial[end, 0] = -1.0
+    twist[end, 1], twist[end, 2] = -arms[end, 2], arms[end, 1]
+    pinch[:, 2] = lower.double() * upper.sum() - upper.double() * lower.sum()
+    kinds = {"compressed": axial, "twisted": twist, "pinched": pinch}
+    found = {}
+    for name, force in kinds.items():
+        force = force / _deflection(scene, force)
+        sizes = rng.uniform(0.04, 0.4, count)
+        if name == "compressed":
+            sizes = rng.uniform(0.3, 0.98, count) * _critical(scene, force)
+        loads = []
+        for size, small in zip(sizes, 10 ** rng.uniform(-5, -1, count), strict=True):
+            across = zero.clone()
+            across[end, 1:] = torch.from_numpy(rng.standard_normal(2))
+            loads.append(size * force + 0.4 * small * across / _deflection(scene, across))
+        samples = solved(scene, Load(torch.stack(loads), torch.ones(count).double()))
+        stable = [_is_stable(scene, u) for u in samples.displacement.split(1)]
+        found[name] = Sample(*(column[stable] for column in samples))
+    return found
+
+
+def _deflection(scene: Scene, force: Tensor) -> float:
+    """Return the largest linear displacement of a node over L under a force (N, D) [-]."""
+    return float(scene.linear.solve_force(force).norm(dim=1).max())
+
+
+def _is_stable(scene: Scene, displacement: Tensor) -> bool:
+    return not scene.newton.stability(displacement).negative_pivots
+
+
+def _critical(scene: Scene, force: Tensor) -> float:
+    """Return the factor of a force (N, D) [-] at which the body becomes unstable."""
+
+    def is_stable(factor: float) -> bool:
+        found = solve(scene.newton, Load(factor * force[None], torch.ones(1).double()))
+        return bool(found.converged) and _is_stable(scene, found.displacement)
+
+    high = 1e-4
+    while is_stable(high) and high < 1.0:
+        high *= 2
+    low = high / 2
+    for _ in range(10):
+        middle = (low + high) / 2
+        low, high = (middle, high) if is_stable(middle) else (low, middle)
+    return low
+
+
 def estimates(
-    body: str, scene: Scene, data: OfflineData, surrogates: Mapping[str, Surrogate], count: int
+    body: str,
+    scene: Scene,
+    samples: Sample,
+    simulators: Mapping[str, Simulator],
+    more: Mapping[str, Sample] = {},  # not changed
 ) -> Iterator[Estimate]:
-    """Yield the estimates of the linear solution and of trained surrogates.
+    """Yield true and estimated errors of the answers of simulators.
 
     Args:
         body: Name of the body.
         scene: The scene.
-        data: Its data set.
-        surrogates: Surrogates of the scene, by name.
-        count: Largest number of test loads, which are also doubled.
+        samples: Solved loads in range, which are also doubled.
+        simulators: Simulators of the scene, by name.
+        more: Further solved loads, by name.
     """
-    test = Sample(*(column[:count] for column in data.samples("test")))
-    doubled = solved(scene, test.load._replace(force=2 * test.force))
-    print(f"{body}: {cost(scene, test)}", flush=True)
-    states = data.samples("train").displacement
-    for title, samples in ((IN_RANGE, test), (TWICE, doubled)):
-        measure = partial(measured, scene, samples)
-        for name, predict, newton in _predictions(scene, surrogates, states):
-            for stepped in (False, True) if newton else (False,):
-                with one_thread(), torch.inference_mode():
-                    for found in measure(predict, newton, stepped=stepped):
-                        label = name + STEPPED * stepped
-                        yield replace(found, body=body, prediction=label, loads=title)
+    doubled = solved(scene, samples.load._replace(force=2 * samples.force))
+    for title, some in {IN_RANGE: samples, TWICE: doubled, **more}.items():
+        for name, sim in simulators.items():
+            for call, options in CALLS.items():
+                for found in measured(sim, some, options):
+                    yield replace(found, body=body, prediction=name, loads=title, call=call)
 
 
-def trained(scene: Scene, data: OfflineData, epochs: int) -> dict[str, Surrogate]:
-    """Return trained surrogates of several accuracies, by name."""
+def measured(sim: Simulator, samples: Sample, options: Mapping[str, float]) -> Iterator[Estimate]:
+    """Yield true and estimated errors of answers to solved loads; the names are empty."""
+    for load, exact in zip(samples.load.unbatch(), samples.displacement, strict=True):
+        answer = sim(**{k: v[0] for k, v in sim.scene.si_inputs(load).items()}, **options)
+        error = float((answer.displacement / sim.scene.length - exact).norm() / exact.norm())
+        yield Estimate("", "", "", "", answer.method, error, answer.error)
+
+
+def trained(scene: Scene, data: OfflineData, epochs: int) -> dict[str, Simulator]:
+    """Return simulators with surrogates of several accuracies, by name."""
     torch.manual_seed(0)
     muon = partial(Muon, lr=5e-3)
     surrogates = {
@@ -217,78 +285,32 @@ def trained(scene: Scene, data: OfflineData, epochs: int) -> dict[str, Surrogate
             check_val_every_n_epoch=epochs, **quiet,
         )  # fmt: skip
         trainer.fit(surrogate, datamodule=data)
-        surrogate.eval()
-    return surrogates
-
-
-def _predictions(
-    scene: Scene, surrogates: Mapping[str, Surrogate], states: Tensor
-) -> Iterator[tuple[str, Predict, SubspaceNewton | None]]:
-    """Yield predictions by name, each with Newton's method in the modes of the model, if any."""
-
-    def linear(load: Load) -> Tensor:
-        return torch.stack([scene.linear.solve(force) for force in load.force])
-
-    yield "linear", linear, None
-    for name, surrogate in surrogates.items():
-        net = surrogate.net
-        newton = None
-        if isinstance(net, HasCorrection):
-            newton = net.correction()
-        elif isinstance(net, Correctable):
-            newton = net.galerkin(states, rank=MODES, tolerance=CUBATURE_TOL)
-        yield name, surrogate.predict, newton
-
-
-def measured(
-    scene: Scene,
-    samples: Sample,
-    predict: Predict,
-    newton: SubspaceNewton | None,
-    *,
-    stepped: bool = False,
-) -> Iterator[Estimate]:
-    """Yield true and estimated errors of a prediction for each load; the names are empty.
-
-    Args:
-        scene: The scene.
-        samples: Loads with their solutions.
-        predict: Function from a load to displacements, (B, N, D) [-].
-        newton: Newton's method in the modes of the model; None: the estimate in modes is NaN.
-        stepped: Correct the prediction by `newton` first, with which the simulator begins, too.
-    """
-    for load, exact in zip(samples.load.unbatch(), samples.displacement, strict=True):
-        u, modes = predict(load), math.nan
-        if newton is not None:
-            states = newton.states(
-                load, guess=u, max_iter=MAX_STEPS if stepped else 0, error_tol=STEP_TOL
-            )
-            *_, last = states
-            u, modes = last.displacement, last.error + newton.outside_error
-        error = float((u[0] - exact).norm() / exact.norm())
-        corotational, known = corotational_error(scene.linear, load, u), math.inf
-        amplitude, distance = scene.loads.project(load.force)
-        in_range = amplitude < 1 + ROUNDOFF and distance <= MAX_DISTANCE  # False if it is NaN
-        if newton is not None and newton.outside_error > 0 and in_range:
-            known = modes
-        reported = estimate_error(scene.linear, load, u, in_modes=known).error
-        yield Estimate("", "", "", error, corotational, modes, reported)
+    states = data.samples("train").displacement
+    found = {name: Simulator(surrogate) for name, surrogate in surrogates.items()}
+    found["pod + modes"] = Simulator.corrected(surrogates["pod"], states, rank=MODES)
+    return found
 
 
 def summarised(found: Sequence[Estimate]) -> list[Row]:
     """Return a row for each body, prediction and set of loads."""
     rows = []
-    for names, group in groupby(found, key=lambda one: (one.body, one.prediction, one.loads)):
-        members = list(group)
+    named = sorted(found, key=lambda one: (one.body, one.loads))  # stable
+    for names, group in groupby(named, key=lambda one: (one.body, one.prediction, one.loads)):
+        members = [one for one in group if one.error > EXACT]
         errors = np.array([one.error for one in members])
-        estimated = [np.array([getattr(one, name) for one in members]) for name in ESTIMATORS]
-        quantiles = [value for each in estimated for value in _quantiles(each / errors)]
-        unknown = int(np.isinf(estimated[-1]).sum())
-        rows.append(Row(*names, len(members), unknown, float(np.median(errors)), *quantiles))
+        ratios = np.array([one.estimated for one in members]) / errors
+        finite = ratios[np.isfinite(ratios)]
+        quantiles = np.quantile(finite, SHARES) if len(finite) else [math.nan] * len(SHARES)
+        said = ratios[[one.estimated < SAID for one in members]]
+        rows.append(
+            Row(
+                *names,
+                count=len(members),
+                unknown=len(ratios) - len(finite),
+                error=float(np.median(errors)) if len(errors) else math.nan,
+                **dict(zip(("p5", "median", "p95"), map(float, quantiles), strict=True)),
+                least=float(said.min()) if len(said) else math.nan,
+                missed=int((said < LEAST).sum()),
+            )
+        )
     return rows
-
-
-def _quantiles(ratios: np.ndarray) -> list[float]:
-    """Return the quantiles `SHARES` of the finite ratios; NaN without any."""
-    finite = ratios[np.isfinite(ratios)]
-    return np.quantile(finite, SHARES).tolist() if len(finite) else [math.nan] * len(SHARES)

@@ -1,8 +1,9 @@
 """Calibrate the estimated errors of the simulator: python scripts/error_estimates.py.
 
-Compares the estimated with the true errors of predictions, in range and at twice the range. Trains
-models on several bodies, or takes those of a folder of runs (run=runs/beam_nh_loss). Writes the
-ratios of all loads, their quantiles and a figure.
+Compares the estimated with the true errors of answers of the simulator: in range, at twice the
+range, and under loads that compress, twist and pinch the body. Trains models on several bodies, or
+takes those of a folder of runs (run=runs/beam_nh_loss), which get no loads of the latter kind.
+Writes the errors of all answers, quantiles of their ratios and a figure.
 """
 
 import time
@@ -19,7 +20,7 @@ from dpl.commands.cli import command
 if TYPE_CHECKING:
     from benchmarks.error_estimates import Estimate
 
-COUNTS = tuple((int, name, 1, 10**6) for name in ("train", "val", "test", "epochs"))
+COUNTS = tuple((int, name, 1, 10**6) for name in ("train", "val", "test", "epochs", "softened"))
 KEYS = ((Sequence[str], "bodies"), (str, "name"), *COUNTS)
 
 
@@ -53,18 +54,22 @@ def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator["Estimate"]:
         scene = error_estimates.BODIES[body]()
         print(*scene.describe()[0], flush=True)
         data = error_estimates.solved_data(scene, sizes, folder / "data" / body)
-        surrogates = error_estimates.trained(scene, data, sizes.epochs)
-        yield from error_estimates.estimates(body, scene, data, surrogates, sizes.test)
+        simulators = error_estimates.trained(scene, data, sizes.epochs)
+        test = error_estimates.first(data.samples("test"), sizes.test)
+        more = error_estimates.softened(scene, cfg.softened)
+        yield from error_estimates.estimates(body, scene, test, simulators, more)
         print(f"{body}: {time.perf_counter() - start:.0f} s", flush=True)
 
 
 def _of_runs(cfg: DictConfig) -> Iterator["Estimate"]:
     """Yield the estimates of all runs in a folder."""
     from benchmarks import error_estimates
+    from dpl.inference import Simulator
 
     runs = config.load_runs(cfg.run)
     first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
     data = config.load_data(first, scene)
-    surrogates = {name: surrogate for name, (_, surrogate) in runs.items()}
-    yield from error_estimates.estimates(Path(cfg.run).name, scene, data, surrogates, cfg.test)
+    simulators = {name: Simulator(surrogate) for name, (_, surrogate) in runs.items()}
+    test = error_estimates.first(data.samples("test"), cfg.test)
+    yield from error_estimates.estimates(Path(cfg.run).name, scene, test, simulators)

@@ -21,7 +21,7 @@ from dpl.system.files import DataSetError
 def parts(cfg: DictConfig) -> tuple["dpl.Scene", Any, "dpl.Surrogate", Any]:
     """Return scene, data, surrogate and trainer of a run without solving or writing."""
     resumed = config.check_resumed(cfg)
-    scene = config.build_scene(config.with_mesh_of_resumed(cfg))
+    scene = config.build_scene(config.with_files_of_resumed(cfg))
     data = config.instantiate(cfg, "data", scene=scene)
     surrogate = config.build_surrogate(cfg, scene)
     _check_data(surrogate, data)
@@ -112,7 +112,10 @@ def _train(cfg: DictConfig) -> float | None:
         torch.distributed.destroy_process_group()
     if not trainer.is_global_zero or trainer.fast_dev_run:
         return None
-    _, best = config.load_run(folder, trust=True, scene=scene)
+    try:
+        _, best = config.load_run(folder, trust=True, scene=scene)
+    except config.ConfigError as error:  # its weights or answers are not finite
+        raise training.Diverged(f"training has diverged: {error}; lower optimizer.lr") from error
     rows = evaluation.evaluate(best, config.load_data(cfg, scene).samples("test"), folder)
     prediction = next(row for row in rows if row.solver == evaluation.PREDICTION)
     if not math.isfinite(prediction.errors["e_mean"]):

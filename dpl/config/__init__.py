@@ -22,7 +22,7 @@ if TYPE_CHECKING:
         check_weights,
         resumed_config,
         save_config,
-        with_mesh_of_resumed,
+        with_files_of_resumed,
     )
     from dpl.config.run_folder import (
         load_data,

@@ -1,5 +1,6 @@
 """Begin or resume a training run: write its configuration, compare it with that of the run."""
 
+import shutil
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,9 +16,9 @@ from dpl.config.build import NOT_IDENTITY, error_in, instantiate, to_container
 from dpl.config.run_folder import (
     MESH,
     checked_config,
-    has_mesh_file,
     read_config,
-    with_copied_mesh,
+    with_copied_files,
+    with_own_data,
 )
 from dpl.config.validation import ConfigError
 from dpl.fem import write_mesh_exactly
@@ -35,7 +36,9 @@ MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:
-    """Write a configuration without interpolations, and a copy of its mesh file, to a folder.
+    """Write a configuration without interpolations, and copies of its files, to a folder.
+
+    A mesh is written as it was checked; other files are copied byte for byte.
 
     Raises a `ConfigError` if the folder contains another run that is not resumed.
     """
@@ -44,13 +47,16 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
             f"run = {folder} contains a run; resume it with ckpt_path=last or choose another folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    source = with_mesh_of_resumed(cfg)
-    if has_mesh_file(source) and Path(source.mesh.path) != folder / MESH:
-        with warnings.catch_warnings():
+    source = with_files_of_resumed(cfg)
+    for path, own in with_copied_files(source, folder)[1].values():
+        if path == own:
+            continue
+        with path.open("rb") as origin, atomic_write(own) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # printed when the mesh was read first
-            mesh = instantiate(source, "mesh")
-        with atomic_write(folder / MESH) as file:
-            write_mesh_exactly(Path(file.name), mesh)
+            if own.name == MESH:
+                write_mesh_exactly(Path(file.name), instantiate(source, "mesh"))
+            else:
+                shutil.copyfileobj(origin, file)
     (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(to_container(cfg))))
 
 
@@ -81,6 +87,7 @@ def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     before = checked_config(path, trust=cfg.get("trust") or requested)
     kept = {key: value for key, value in before.items() if key not in OF_THE_SESSION}
     found, given = OmegaConf.create({**requested, **kept}), OmegaConf.create(requested)
+    found = with_own_data(found, path.parent)
     for one in OverridesParser.create().parse_overrides(list(overrides)):
         key = one.key_or_group
         root = key.partition(".")[0]
@@ -98,10 +105,10 @@ def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     return found
 
 
-def with_mesh_of_resumed(cfg: DictConfig) -> DictConfig:
-    """Return a configuration that reads its mesh from the copy in the run to resume, if any."""
+def with_files_of_resumed(cfg: DictConfig) -> DictConfig:
+    """Return a configuration that reads its files from the copies in the run to resume, if any."""
     checkpoint = _resumed(cfg)
-    return cfg if checkpoint is None else with_copied_mesh(cfg, checkpoint.parent.parent)
+    return cfg if checkpoint is None else with_copied_files(cfg, checkpoint.parent.parent)[0]
 
 
 def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,7 @@ from dpl.config.build import (
     instantiate,
     moduli,
     require_keys,
+    to_container,
 )
 from dpl.config.validation import ConfigError
 from dpl.fem import moduli_of
@@ -33,19 +35,52 @@ from dpl.system.memory import at_most
 
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
 MAX_BYTES = 100_000  # of the configuration of a run
+UNUSABLE = (  # errors of a damaged checkpoint
+    *(OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, ArithmeticError),
+)
 
 
-def has_mesh_file(cfg: DictConfig) -> bool:
-    return hydra.utils.get_object(cfg.mesh._target_) is load_mesh
+def with_copied_files(
+    cfg: DictConfig, folder: Path, *, required: bool = False
+) -> tuple[DictConfig, dict[str, tuple[Path, Path]]]:
+    """Return a configuration that reads the files of its scene from their copies in a folder.
+
+    Args:
+        cfg: The configuration.
+        folder: Folder of the run.
+        required: Refuse files without a copy; else these are read from where they are.
+
+    Returns:
+        The configuration, and the path and the place of the copy of each file, by key.
+
+    Raises:
+        ConfigError: A copy is required and missing.
+    """
+    found, files = to_container(cfg), {}
+    scene = {key: found[key] for key in (*SCENE, "fixed", "regions") if key in found}
+    for key, call, option in list(validation.options_with_files(scene)):
+        is_mesh = hydra.utils.get_object(call["_target_"]) is load_mesh
+        path = Path(call[option])
+        own = folder / (MESH if is_mesh else f"{key}{path.suffix}".replace("/", "_"))
+        files[key] = path, own
+        if os.path.isfile(own) and own.resolve().parent == folder.resolve():
+            call[option] = str(own)
+        elif required:
+            remedy = "write it there by dpl.fem.write_mesh_exactly" if is_mesh else "copy it there"
+            raise ConfigError(
+                f"{key} = {path} must be kept in the run's folder as {own}; {remedy}, or load the "
+                "run with trust=True"
+            )
+    return OmegaConf.create(found), files
 
 
-def with_copied_mesh(cfg: DictConfig, folder: Path) -> DictConfig:
-    """Return a configuration that reads its mesh from the copy in a folder, `cfg` without one."""
-    own = folder / MESH
-    is_there = own.is_file() and own.resolve().parent == folder.resolve()
-    if not is_there or not has_mesh_file(cfg):
-        return cfg
-    return OmegaConf.merge(cfg, {"mesh": {"path": str(own)}})
+def with_own_data(cfg: DictConfig, folder: Path) -> DictConfig:
+    """Return the configuration of a run whose data set is there, or is made in the run's folder."""
+    if named := OmegaConf.select(cfg, "data.folder"):
+        inside = folder.resolve() in Path(named).resolve().parents
+        if not inside and not (Path(named) / "scene.json").is_file():
+            cfg.data.folder = str(folder / "data")
+    return cfg
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -119,48 +154,46 @@ def load_run(
         if not path.is_file():
             raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
     cfg = OmegaConf.create(checked_config(config, trust=trust))
-    with _usable(best):
+    if not trust:
+        cfg = with_own_data(cfg, Path(folder))
+    with usable(best):
         checkpoint = checkpoints.read(best)
         points = checkpoint.get("OfflineData", {}).get("points")
         if points and OmegaConf.select(cfg, "data.train") == "auto":
             cfg.data.train = int(points[-1][0])
     scene = _scene_of_run(cfg, best, checkpoint, scene, trust=trust)
     surrogate = build_surrogate(cfg, scene)
-    with _usable(best):
+    with usable(best):
         surrogate.on_load_checkpoint(checkpoint)
         surrogate.load_state_dict(checkpoint["state_dict"])
-    return cfg, surrogate.eval()
+        surrogate.eval().check_predictions()
+    return cfg, surrogate
 
 
 @contextlib.contextmanager
-def _usable(checkpoint: Path) -> Iterator[None]:
+def usable(checkpoint: str | Path) -> Iterator[None]:
+    """Turn the errors of a damaged checkpoint into a `ConfigError` that names it."""
     try:
         yield
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except UNUSABLE as error:
+        reason = " ".join(str(error).split()[:60]) or type(error).__name__
         raise ConfigError(f"{checkpoint} cannot be used: {reason}") from error
 
 
 def _scene_of_run(
     cfg: DictConfig, weights: Path, checkpoint: dict[str, Any], known: Scene | None, *, trust: bool
 ) -> Scene:
-    """Return the scene of a run; a mesh file is read from the folder of the run.
+    """Return the scene of a run; its files are read from the folder of the run.
 
     It is `known` if that has the size and the Young's moduli of the run.
 
-    Without `trust` the run needs a copy of its mesh file, and its checkpoint bounds the number of
+    Without `trust` the run needs copies of its files, and its checkpoint bounds the number of
     nodes: no network has fewer weights than its body has nodes.
     """
     require_keys(cfg, *SCENE)
-    folder = weights.parent.parent
-    own = with_copied_mesh(cfg, folder)
+    own, _ = with_copied_files(cfg, weights.parent.parent, required=not trust)
     if trust:
         return _reused_or_built(own, known)
-    if own is cfg and has_mesh_file(cfg):
-        raise ConfigError(
-            f"mesh.path = {cfg.mesh.path} must be kept in the run's folder as {folder / MESH}; "
-            "write it there (dpl.fem.write_mesh_exactly), or load the run with trust=True"
-        )
     most = sum(t.numel() for t in checkpoint["state_dict"].values() if torch.is_tensor(t))
     if isinstance(nodes := checkpoint.get("nodes"), int):
         most = min(nodes, most)

@@ -314,6 +314,17 @@ def options_of(node: Mapping[str, Any]) -> set[str]:
     return set()
 
 
+def options_with_files(node: Any) -> Iterator[tuple[str, dict[str, Any], str]]:
+    """Yield key, call and option of each file that a checked node names: options of type `Path`."""
+    for path, call in iter_nodes(node):
+        if isinstance(call, dict) and "_target_" in call:
+            _, hints = _signature(_target(path, call["_target_"]))
+            for option, value in call.items():
+                hint = hints.get(option)
+                if isinstance(value, str) and Path in (hint, *typing.get_args(hint)):
+                    yield f"{path}.{option}", call, option
+
+
 def suggestion(name: str, known: Collection[str], place: str = "") -> str:
     """Return an advice for an unknown name: the most similar known name at a place, or all."""
     if near := difflib.get_close_matches(name, known, 1):

@@ -14,8 +14,18 @@ from torch import Tensor
 from dpl.evaluation.nodal_fields import nodal_fields
 from dpl.evaluation.tables import power, share, show_cells
 from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
-from dpl.fem import LinearSolver, Load, Newton, Problem, Solution, Solver, Status, write_mesh
-from dpl.inference import Corrected, Direct, Hybrid, Simulator, estimate_error
+from dpl.fem import (
+    LinearSolver,
+    Load,
+    Newton,
+    Problem,
+    Solution,
+    Solver,
+    Status,
+    estimate_error,
+    write_mesh,
+)
+from dpl.inference import Corrected, Direct, Hybrid, Simulator
 from dpl.models import HasCorrection
 from dpl.scene import Sample, Scene
 from dpl.system.threads import one_thread

@@ -6,11 +6,6 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.inference.answer import Answer
-    from dpl.inference.error_estimate import (
-        ErrorEstimate,
-        estimate_error,
-        nearest,
-    )
     from dpl.inference.grasp import GraspAnswer, Gripper
     from dpl.inference.hybrid import (
         Corrected,

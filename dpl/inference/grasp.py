@@ -12,10 +12,17 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dpl.fem import AndersonSolver, Load, Newton, RigidPatch, Solution, evaluate_solution
+from dpl.fem import (
+    AndersonSolver,
+    Load,
+    Newton,
+    RigidPatch,
+    Solution,
+    estimate_error,
+    evaluate_solution,
+)
 from dpl.inference.answer import UNRELIABLE, relative, summarise
 from dpl.inference.arguments import as_load, as_numbers
-from dpl.inference.error_estimate import estimate_error
 from dpl.inference.grasp_forces import Forces, predicted_forces
 from dpl.inference.hybrid import Hybrid
 from dpl.inference.request import Budget, Request

@@ -12,17 +12,20 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from dpl.fem import Load, Problem, Solution, Status, SubspaceNewton, evaluate_solution
+from dpl.fem import (
+    Load,
+    Problem,
+    Solution,
+    Status,
+    SubspaceNewton,
+    estimate_error,
+    evaluate_solution,
+)
 from dpl.fem.mesh.regions import Region
 from dpl.fem.solvers import concatenate
+from dpl.fem.solvers.error_estimate import PRODUCTS, nearest
 from dpl.inference.answer import Answer, answer_like, summarise
 from dpl.inference.arguments import as_load, as_numbers
-from dpl.inference.error_estimate import (
-    PRODUCTS,
-    SUFFICIENT,
-    estimate_error,
-    nearest,
-)
 from dpl.inference.grasp import GraspAnswer, Gripper
 from dpl.inference.hybrid import default_hybrid
 from dpl.inference.request import Candidate, Request
@@ -33,6 +36,7 @@ from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
+SUFFICIENT = 2e-3  # steps leave an error of 1e-3 in the modes, and about as much outside [-]
 ERROR = 1e-3  # estimated relative error above which they are made [-]
 POOR_STREAM = 9_003  # of the loads by which the predictions are judged
 PACE_DECAY = 0.9  # of a time from call to call

@@ -11,6 +11,7 @@ from dpl.models.graph import Graph, Integers, hierarchy, means
 from dpl.models.linear_base import Base
 from dpl.models.message_passing import Level, Messages
 from dpl.models.scalar_inputs import ScalarInputs
+from dpl.models.stored_buffers import StoredBuffers, check_indices
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
@@ -142,7 +143,7 @@ class GNN(nn.Module):
         return lines
 
 
-class Step(nn.Module):
+class Step(StoredBuffers):
     """Map from the members of a level to the clusters of the next level."""
 
     cluster: Tensor
@@ -157,6 +158,10 @@ class Step(nn.Module):
         self.register_buffer("cluster", torch.from_numpy(cluster))
         self.register_buffer("arm", torch.from_numpy(arm / coarse.spacing).float())
         self.register_buffer("share", torch.from_numpy(1 / np.bincount(cluster)).float())
+
+    def check_buffers(self) -> None:
+        """See `StoredBuffers`."""
+        check_indices(self.clusters, cluster=self.cluster)
 
     def sum(self, values: Tensor) -> Tensor:
         """Return the sums over members (K, B, ...) of each cluster."""

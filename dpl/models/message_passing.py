@@ -9,11 +9,12 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import gelu
 
 from dpl.models.graph import Floats, Graph
+from dpl.models.stored_buffers import StoredBuffers, check_indices
 
 CACHE = 2**17  # numbers of a block of messages that fit into the cache of a processor
 
 
-class Level(nn.Module):
+class Level(StoredBuffers):
     """The graph of a level as tensors, and the encoder of its inputs."""
 
     receiver: Tensor
@@ -49,6 +50,10 @@ class Level(nn.Module):
         self.load_scale = count / nodes if averages else math.sqrt(count / nodes)
         self.load = nn.Linear(dim if first else dim + dim * dim, width, bias=False)
         self.place = nn.Sequential(nn.Linear(dim + 1, width), nn.GELU(), nn.Linear(width, width))
+
+    def check_buffers(self) -> None:
+        """See `StoredBuffers`."""
+        check_indices(len(self.flags), receiver=self.receiver, sender=self.sender)
 
     def forward(self, force: Tensor, moment: Tensor) -> Tensor:
         """Return the state (K, B, width) under forces (K, B, D) and moments (K, B, D D)."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, Problem, SubspaceNewton
+from dpl.fem import LinearSolver, Load, Problem, SubspaceNewton, estimate_error
 from dpl.scene import Sample
 
 RANKS = (60, 160)  # numbers of modes that are tried, and all modes
@@ -50,6 +50,27 @@ def choose_newton(
             break
     assert best is not None
     return best
+
+
+def remaining_error(
+    solver: SubspaceNewton, linear: LinearSolver, loads: Load, guesses: Tensor
+) -> float:
+    """Return the largest relative error that the steps leave [-], as a correction estimates it.
+
+    The correction is that of K(0) in the rotated frames of the nodes. The error is infinite where
+    an element is inverted.
+
+    Args:
+        solver: Newton's method in the modes.
+        linear: Linear solver of the body.
+        loads: The loads, (S, N, D).
+        guesses: Their predictions, (S, N, D).
+    """
+    pairs = zip(loads.unbatch(), guesses, strict=True)
+    return max(
+        estimate_error(linear, load, _last(solver, load, guess)[None], products=0).error
+        for load, guess in pairs
+    )
 
 
 def _after(solver: SubspaceNewton, samples: Sample, guesses: Tensor) -> Tensor:

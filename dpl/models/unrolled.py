@@ -1,12 +1,14 @@
 """Unrolled reduced solver: a few iterations in a subspace whose linear maps are fitted to data."""
 
+from dataclasses import replace
 from typing import Any, cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dpl.fem import InvariantBasedMaterial, Material, SubspaceNewton, symmetries
 from dpl.fem.materials.heterogeneous import one_law
+from dpl.fem.parity import Parities
 from dpl.fem.rom.compiled_prediction import (
     CompiledPrediction,
     LawArguments,
@@ -20,19 +22,24 @@ from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.fem.symmetry import cell_images
 from dpl.models.invariant_basis import orthonormal_fields
+from dpl.models.linear_base import SCALE_STREAM
 from dpl.models.linear_response import LinearResponse
-from dpl.models.newton_choice import LOADS, choose_newton
+from dpl.models.newton_choice import LOADS, choose_newton, remaining_error
+from dpl.models.stored_buffers import StoredBuffers, check_indices
 from dpl.models.unrolled_fit import Maps, cell_positions, fit_in_best_modes
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.threads import on_threads
 
+FEW = 8  # loads at which the error outside the modes is measured
 CELL_STATES = 256  # states at which the cells of a correction are chosen
 MAX_SIZE = 100_000  # of rank, cells and stages
+# buffers and axes with the numbers of modes, cells, maps, and modes and cells of Newton's method
+SIZES = (("modes", 1), ("cells", 0), ("maps", 0), ("newton_modes", 1), ("newton_cells", 0))
 _AtLaw = tuple[LawArguments, ReducedInverse, LawWeights | LawEntries]
 
 
-class Unrolled(nn.Module):
+class Unrolled(StoredBuffers):
     """Linear solution and a few quasi-Newton iterations with fitted maps.
 
     With R modes V of the nonlinear displacement and G, which maps their coordinates to displacement
@@ -81,7 +88,8 @@ class Unrolled(nn.Module):
         newton_modes: Modes of Newton's method that follows, (n, K).
         newton_cells: Cells of its tangent, (C,).
         newton_weights: Their weights, (C,).
-        outside_error: Largest relative error that it left at held-out samples, ().
+        outside_error: Largest relative error that it left at held-out samples, (). `correction`
+            takes the error that it measures at a few loads if that is larger.
         fitted: True after `fit`, ().
     """
 
@@ -133,24 +141,8 @@ class Unrolled(nn.Module):
         self.group = symmetries(scene.problem, also=also) if symmetry else []
         self.extra_inputs = ("parameters",) if scene.loads.parameter_ranges else ()
         self.linear = LinearResponse(scene, self.group)
-        dim = scene.problem.shape[1]
-        empty = torch.zeros(0, dtype=torch.float64)
-        for name, value in {
-            "modes": torch.zeros(int(scene.problem.free.sum()), 0),
-            "parity": torch.zeros(0, dtype=torch.int64),
-            "stiffness": empty.view(3, 0, 1),
-            "cells": torch.zeros(0, dtype=torch.int64),
-            "gradients": torch.zeros(1, 0, dim, dim, dtype=torch.float64),
-            "first_map": torch.zeros(0, 0),
-            "maps": torch.zeros(0, 0, 0),
-            "limits": torch.ones(1, dtype=torch.float64),
-            "newton_modes": torch.zeros(int(scene.problem.free.sum()), 0),
-            "newton_cells": torch.zeros(0, dtype=torch.int64),
-            "newton_weights": empty,
-            "outside_error": torch.tensor(0.0, dtype=torch.float64),
-            "fitted": torch.tensor(False),
-        }.items():
-            self.register_buffer(name, value)
+        for name, (shape, dtype) in self._layout().items():
+            self.register_buffer(name, torch.zeros(shape, dtype=dtype))
         self._stiffness = ReducedStiffness(self.stiffness)
         self._compiled: tuple[Tensor, CompiledPrediction] | None = None
         self._law_of_samples = scene.problem.material  # perhaps with ranges
@@ -158,6 +150,28 @@ class Unrolled(nn.Module):
         dofs = scene.problem.free.flatten().nonzero()[:, 0]
         self.register_buffer("dofs", dofs, persistent=False)
         self.register_buffer("prescribed", scene.problem.prescribed, persistent=False)
+
+    def _layout(
+        self, modes: int = 0, cells: int = 0, maps: int = 0, newton_modes: int = 0, newton: int = 0
+    ) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
+        """Return shapes and types of the buffers for numbers of modes, cells, maps, see `SIZES`."""
+        free, dim = int(self.scene.problem.free.sum()), self.scene.problem.shape[1]
+        entries = cells * dim * dim
+        return {
+            "modes": ((free, modes), torch.float32),
+            "parity": ((modes,), torch.int64),
+            "stiffness": ((len(self.linear.terms) + 1, modes, modes + 1), torch.float64),
+            "cells": ((cells,), torch.int64),
+            "gradients": ((modes + 1, cells, dim, dim), torch.float64),
+            "first_map": ((entries, modes), torch.float32),
+            "maps": ((maps, 2 * entries, modes), torch.float32),
+            "limits": ((1 + maps,), torch.float64),
+            "newton_modes": ((free, newton_modes), torch.float32),
+            "newton_cells": ((newton,), torch.int64),
+            "newton_weights": ((newton,), torch.float64),
+            "outside_error": ((), torch.float64),
+            "fitted": ((), torch.bool),
+        }
 
     # ------------------------------------------------------------------ prediction
 
@@ -317,10 +331,13 @@ class Unrolled(nn.Module):
         """See `HasCorrection`."""
         if not self.newton_modes.shape[1]:
             return None
-        problem, error = self.scene.problem, float(self.outside_error)
+        problem, load = self.scene.problem, self.scene.loads.sample((0, SCALE_STREAM), range(FEW))
         vectors = orthonormal_fields(self.newton_modes, problem.free)
         cells = Cubature(self.newton_cells, self.newton_weights, 0.0)
-        return SubspaceNewton(problem, vectors, cells, outside_error=error)
+        solver = SubspaceNewton(problem, vectors, cells)
+        guesses = self(load.force, *((load.parameters,) if self.extra_inputs else ()))
+        measured = remaining_error(solver, self.scene.linear, load, guesses)
+        return replace(solver, outside_error=max(float(self.outside_error), measured))
 
     def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
         """Return Newton's method in the first modes; see `Correctable`.
@@ -351,14 +368,30 @@ class Unrolled(nn.Module):
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Take the sizes of the checkpoint, which the fit has chosen."""
-        resize_buffers(self, state, prefix)
+        known = [name for name in self._layout() if f"{prefix}{name}" in state]
+        shapes = {name: tuple(state[f"{prefix}{name}"].shape) for name in known}
+        sizes = [dict(enumerate(shapes.get(name, ()))).get(axis, 0) for name, axis in SIZES]
+        for name, (shape, _) in self._layout(*sizes).items():
+            if shapes.get(name, shape) != shape:
+                raise ValueError(f"{prefix}{name} of shape {shapes[name]} must have shape {shape}")
+            setattr(self, name, getattr(self, name).new_zeros(shape))
         super()._load_from_state_dict(state, prefix, *rest)
         self._prepare()
 
-
-def resize_buffers(module: nn.Module, state: dict[str, Any], prefix: str) -> None:
-    """Give the buffers of a module the sizes that they have in a state dict."""
-    for name, buffer in module.named_buffers(recurse=False):
-        found = state.get(f"{prefix}{name}")
-        if isinstance(found, Tensor) and found.ndim == buffer.ndim:
-            setattr(module, name, buffer.new_empty(found.shape))
+    def check_buffers(self) -> None:
+        """See `StoredBuffers`."""
+        problem = self.scene.problem
+        count, cells = len(problem.cells), self.cells
+        check_indices(count, cells=cells, newton_cells=self.newton_cells)
+        parities = Parities.of(self.group, problem.shape[1])
+        check_indices(len(parities.members), parity=self.parity)
+        images = cell_images(problem, self.group)[:, cells.cpu()]
+        if len(cells.unique()) < len(cells) or not torch.isin(images, cells.cpu()).all():
+            raise ValueError("cells must be different cells, with all images under the symmetries")
+        for name in ("limits", "newton_weights", "outside_error"):
+            if (getattr(self, name) < 0).any():
+                raise ValueError(f"{name} must be 0 or more")
+        factors = self.linear.terms.factors(problem.reference.material)
+        matrix = ReducedStiffness(self.stiffness.cpu()).at(factors)[0, :, :-1]
+        if torch.linalg.cholesky_ex(matrix).info:
+            raise ValueError("stiffness must be positive definite")

@@ -1,7 +1,7 @@
 """The LightningModule: a network with scales, loss, metrics and optimiser."""
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Self, cast
 
 import lightning as L
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from dpl.fem import Load
 from dpl.fem.symmetry import Symmetry
-from dpl.models.linear_base import LinearBase, check_base, sampled_solutions
+from dpl.models.linear_base import SCALE_STREAM, LinearBase, check_base, sampled_solutions
 from dpl.models.protocols import ClosedFormFit, HasBase, TrainsInCoordinates
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
@@ -22,6 +22,8 @@ from dpl.training.losses.supervised import SquaredErrorLoss
 from dpl.training.metrics import default_metrics
 from dpl.training.random_states import random_states, set_random_states
 from dpl.training.schedules import step_in_time, time_fraction, total_steps
+
+SCALES = ("force_scale", "displacement_scale", "largest_force")
 
 
 class Surrogate(L.LightningModule):
@@ -81,14 +83,13 @@ class Surrogate(L.LightningModule):
                     f"it; set {key} to a number or choose another model"
                 )
         largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
-        names = ("force_scale", "displacement_scale", "largest_force")
         self.base, factors = None, torch.ones(2).double().unbind()
         adds_to_base = _adds_to_base(net)
         if not self._is_closed_form:
             force, linear = sampled_solutions(scene)
             self.base = LinearBase(scene, linear) if adds_to_base else None
             factors = scales(scene, force, linear)
-        for name, value in zip(names, (*factors, largest_force), strict=True):
+        for name, value in zip(SCALES, (*factors, largest_force), strict=True):
             self.register_buffer(name, value.clone())
         self.physics = LossContext(scene.problem, self.largest_force)
         self.val_metrics = default_metrics(scene.problem).clone(prefix="val/")
@@ -361,6 +362,33 @@ class Surrogate(L.LightningModule):
                 + "".join(f"; {line}" for line in self.scene.differences(identity))
             )
         self._random_states = checkpoint.get("random")
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
+        """Load weights; the arguments are those of `torch.nn.Module`.
+
+        Raises:
+            ValueError: A tensor has another type, is not finite, or is none that a fit can give.
+            RuntimeError: The weights are of another network.
+        """
+        own = self.state_dict()
+        for name, stored in state_dict.items():
+            dtype = own[name].dtype if name in own else stored.dtype
+            if stored.dtype != dtype and not stored.is_floating_point() & dtype.is_floating_point:
+                raise ValueError(f"{name} of {stored.dtype} must be of {dtype}")
+            if not stored.to(dtype).isfinite().all():
+                raise ValueError(f"{name} must be finite")
+        found = super().load_state_dict(state_dict, *args, **options)
+        for name in SCALES:
+            if not (value := getattr(self, name)) > 0:
+                raise ValueError(f"{name} = {float(value)} must be above 0")
+        return found
+
+    def check_predictions(self) -> None:
+        """Raise ValueError if a prediction of a load of the scene is not finite."""
+        load = self.scene.loads.sample((0, SCALE_STREAM), range(2))
+        with torch.inference_mode():
+            if not self.predict(load).isfinite().all():
+                raise ValueError("the answers of the network are not finite")
 
     def on_train_start(self) -> None:
         """Restore the states of random number generators of a resumed run."""

@@ -688,6 +688,25 @@ def test_a_configuration_that_no_run_writes_is_refused_by_name(copied, text, rep
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "change", "reported"),
+    [
+        ("net.stages.0.weight", lambda w: w[1:], r"size mismatch for net\.stages\.0\.weight"),
+        ("net.stages.0.weight", lambda w: w.long(), r"net\.stages\.0\.weight of torch\.int64 must"),
+        ("net.stages.0.weight", lambda w: w / 0, r"net\.stages\.0\.weight must be finite"),
+        ("net.stages.0.weight", lambda w: w + 1e38, "the answers of the network are not finite"),
+        ("force_scale", lambda w: -w, r"force_scale = -\S+ must be above 0"),
+    ],
+)
+def test_damaged_weights_are_refused_by_name(copied, name, change, reported):
+    best = copied / "checkpoints" / "best.safetensors"
+    checkpoint = checkpoints.read(best)
+    checkpoint["state_dict"][name] = change(checkpoint["state_dict"][name])
+    checkpoints.write(checkpoint, best)
+    with pytest.raises(ConfigError, match=rf"best\.safetensors cannot be used: .*{reported}"):
+        run_folder.load_run(copied)
+
+
 @pytest.mark.parametrize("harm", ["truncated", "text", "no weights", "no scene"])
 def test_a_damaged_checkpoint_is_refused_by_name(copied, harm):
     best = copied / "checkpoints" / "best.safetensors"
@@ -822,6 +841,30 @@ def test_an_option_of_the_trainer_changes_only_the_machine_of_a_resumed_run(
     assert (longer.trainer.accelerator, longer.trainer.max_epochs) == ("cpu", 7)
     build.check(longer)
     assert resume.check_resumed(longer)["epoch"] == 0
+
+
+@pytest.mark.parametrize(
+    ("named", "used"),
+    [
+        (None, None),
+        ("{elsewhere}", "{run}/data"),
+        ("{run}/more/data", "{run}/more/data"),
+        ("{run}/../{run_name}2", "{run}/data"),
+        ("{data}", "{data}"),  # which is there
+    ],
+)
+def test_a_run_makes_its_data_set_in_its_folder_or_where_the_command_line_says(
+    copied, trained, resumed_config, tmp_path, named, used
+):
+    places = {"elsewhere": tmp_path / "elsewhere", "run": copied, "data": trained[0] / "data"}
+    named, used = (one and one.format(**places, run_name=copied.name) for one in (named, used))
+    cfg = OmegaConf.load(copied / "config.yaml")
+    cfg.data.folder = named
+    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    assert run_folder.load_run(copied)[0].data.folder == used
+    assert resumed_config(copied).data.folder == used
+    assert run_folder.load_run(copied, trust=True)[0].data.folder == named
+    assert resumed_config(copied, "data.folder=here").data.folder == "here"
 
 
 def test_an_experiment_on_the_command_line_is_compared_as_a_whole(trained, resumed_config):

@@ -1,10 +1,11 @@
-"""Laws of runs on a mesh file: a run holds its mesh, and answers wherever it is taken."""
+"""Laws of runs that name files: a run holds copies of them, and answers wherever it is taken."""
 
 import itertools
 import json
 import shutil
 import struct
 
+import meshio
 import numpy as np
 import pytest
 import torch
@@ -15,6 +16,12 @@ from benchmarks.stress.broken_meshes import write
 from dpl import Scene
 from dpl.config import ConfigError, run_folder
 from dpl.fem import box, read_mesh, write_mesh_exactly
+
+FILES = [  # key, origin, copy in the run, remedy where that is missing
+    ("mesh.path", "part.vtu", "mesh.vtu", "write it there by dpl.fem.write_mesh_exactly, or"),
+    ("material.young.file", "cells.vtu", "material.young.file.vtu", "copy it there, or"),
+    ("loads.path", "forces.npy", "loads.path.npy", "copy it there, or"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +39,12 @@ def part(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def overrides(tiny_training):
-    """Overrides of a short training on a mesh file."""
-    kept = [o for o in tiny_training if not o.startswith("mesh.")]
+    """Overrides of a short training on a mesh file, with a field and forces of other files."""
+    kept = [o for o in tiny_training if not o.startswith(("mesh.", "loads."))]
     quiet = "callbacks.progress_bar._target_=lightning.pytorch.callbacks.TQDMProgressBar"
-    return [*kept, quiet, "mesh=file", "trainer.max_epochs=1"]
+    field = "+material.young={_target_:dpl.fem.CellField,values:stiffness,file:cells.vtu}"
+    forces = ["loads=file", "loads.path=forces.npy", "loads.factor=null"]
+    return [*kept, quiet, "mesh=file", field, *forces, "trainer.max_epochs=1"]
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +61,10 @@ def trained(part, overrides, script, done, tmp_path):
     if not said:
         (origin / "home").mkdir()
         shutil.copy(part, origin / "home" / "part.vtu")
+        mesh, random = meshio.read(part), np.random.default_rng(0)
+        mesh.cell_data = {"stiffness": [random.uniform(1, 2, len(mesh.cells[0].data))]}
+        mesh.write(origin / "home" / "cells.vtu")
+        np.save(origin / "home" / "forces.npy", random.standard_normal((3, 45, 3)))
         said["ended"] = script("train", *options, cwd=origin / "home")
         assert said["ended"].status == 0, said["ended"].err
     return shutil.copytree(origin / "home", tmp_path / "home"), options, said["ended"]
@@ -88,7 +101,7 @@ def test_a_run_answers_the_same_where_its_mesh_file_is_not(trained, tmp_path, mo
     shutil.rmtree(home)
     monkeypatch.chdir(tmp_path)
     cfg, after = run_folder.load_run(there)
-    assert cfg.mesh.path == "part.vtu"
+    assert (cfg.mesh.path, cfg.material.young.file) == ("part.vtu", "cells.vtu")
     assert after.scene.fingerprint == before.scene.fingerprint
     assert torch.equal(after.scene.problem.points, before.scene.problem.points)
     with torch.no_grad():
@@ -109,17 +122,21 @@ def test_all_commands_take_a_run_whose_mesh_file_is_gone(moved, script):
         assert ended.status == 0, (name, ended.err)
 
 
-def test_a_run_whose_mesh_file_is_gone_is_resumed(trained, script):
-    home, options, _ = trained
-    (home / "part.vtu").unlink()
-    before = (home / "runs" / "part" / "mesh.vtu").read_bytes()
+def test_a_run_whose_files_are_gone_is_resumed(trained, script):
+    origin, options, _ = trained
+    home = shutil.move(origin, origin.parent / "there")
+    folder = home / "runs" / "part"
+    before = {name: (folder / name).read_bytes() for _, _, name, _ in FILES}
+    scene = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["scene"]
+    for _, name, _, _ in FILES:
+        (home / name).unlink()
     more = [o for o in options if "max_epochs" not in o]
     ended = script("train", *more, "trainer.max_epochs=2", "ckpt_path=last", cwd=home)
     assert ended.status == 0, ended.err
-    assert (home / "runs" / "part" / "mesh.vtu").read_bytes() == before
-    last = torch.load(home / "runs" / "part" / "checkpoints" / "last.ckpt", weights_only=True)
-    assert last["epoch"] == 1
-    # another run that goes on from this one's checkpoint holds the mesh as well
+    assert {name: (folder / name).read_bytes() for name in before} == before
+    last = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    assert (last["epoch"], last["scene"]) == (1, scene)
+    # another run that goes on from this one's checkpoint holds the files as well
     checkpoint = "ckpt_path=runs/part/checkpoints/last.ckpt"
     more = [o for o in more if not o.startswith("run=")]
     ended = script("train", *more, "run=runs/b", checkpoint, "trainer.max_epochs=3", cwd=home)
@@ -127,6 +144,8 @@ def test_a_run_whose_mesh_file_is_gone_is_resumed(trained, script):
     assert np.array_equal(
         read_mesh(home / "runs/b/mesh.vtu").t, read_mesh(home / "runs/part/mesh.vtu").t
     )
+    other = torch.load(home / "runs/b/checkpoints/last.ckpt", weights_only=True)
+    assert (other["epoch"], other["scene"]) == (2, scene)
 
 
 def test_a_run_is_not_resumed_on_another_mesh_file(trained, script, part):
@@ -138,21 +157,21 @@ def test_a_run_is_not_resumed_on_another_mesh_file(trained, script, part):
     assert "mesh.path was part.vtu, is other.vtu" in ended.err
 
 
-def test_a_run_reads_no_mesh_outside_of_its_folder(trained, tmp_path):
+@pytest.mark.parametrize(("key", "origin", "name", "remedy"), FILES)
+def test_a_run_reads_no_file_outside_of_its_folder(trained, monkeypatch, key, origin, name, remedy):
     home, _, _ = trained
-    folder = home / "runs" / "part"
-    cfg = OmegaConf.load(folder / "config.yaml")
-    cfg.mesh.path = str(home / "part.vtu")
-    (folder / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
-    run_folder.load_run(folder)  # by the copy
-    (folder / "mesh.vtu").unlink()
-    with pytest.raises(ConfigError, match=r"mesh\.path = .* must be kept in the run's folder"):
-        run_folder.load_run(folder)
-    (folder / "mesh.vtu").symlink_to(home / "part.vtu")
-    with pytest.raises(ConfigError, match=r"must be kept in the run's folder"):
-        run_folder.load_run(folder)
-    (folder / "mesh.vtu").unlink()
-    run_folder.load_run(folder, trust=True)
+    monkeypatch.chdir(home)
+    copy = home / "runs" / "part" / name
+    reported = rf"{key} = {origin} must be kept in the run's folder as \S+{name}; {remedy}"
+    copy.unlink()
+    with pytest.raises(ConfigError, match=reported) as refused:
+        run_folder.load_run(home / "runs" / "part")
+    assert "\n" not in str(refused.value)
+    copy.symlink_to(home / origin)
+    with pytest.raises(ConfigError, match=reported):
+        run_folder.load_run(home / "runs" / "part")
+    copy.unlink()
+    run_folder.load_run(home / "runs" / "part", trust=True)
 
 
 # ------------------------------------------------------------------ hostile sizes

@@ -8,11 +8,10 @@ import pytest
 import torch
 
 import dpl.inference.simulator as simulator_module
-from dpl.fem import LinearSolver, Load, Problem, Status, SubspaceNewton, solve
+from dpl.fem import LinearSolver, Load, Problem, Status, SubspaceNewton, estimate_error, solve
 from dpl.inference import (
     Simulator,
     default_hybrid,
-    estimate_error,
 )
 from dpl.inference.answer import summarise
 from dpl.models import FCNN

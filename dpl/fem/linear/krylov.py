@@ -93,6 +93,14 @@ def conjugate_gradients(
     raise SingularMatrix(f"no convergence to {rtol:g} in {max_iter} conjugate gradient steps")
 
 
+def scaled_norm(vector: Array) -> float:
+    """Return the Euclidean norm, without overflow or underflow of squares."""
+    largest = float(np.abs(vector).max(initial=0))
+    if not 0 < largest < math.inf:
+        return largest
+    return largest * float(np.linalg.norm(vector / largest))
+
+
 class KrylovStep(NamedTuple):
     """State of conjugate gradients after some steps.
 

@@ -34,7 +34,7 @@ class FileLoads(CombinedLoads):
     """
 
     si_options: ClassVar[tuple[str, ...]] = ("path", "factor")
-    path: str
+    path: str | Path
     factor: Sequence[float] | None = (0.0, 1.0)
 
     def __post_init__(self) -> None:
@@ -117,7 +117,7 @@ class FileLoads(CombinedLoads):
         return super().identity() | {"forces": plain(self.shapes)}
 
 
-def read_forces(path: str, free: NDArray[np.bool_]) -> Array:
+def read_forces(path: str | Path, free: NDArray[np.bool_]) -> Array:
     """Return the forces of a .npy or .npz file, (S, N, D) [N].
 
     Args:

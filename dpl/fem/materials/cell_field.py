@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ class CellField:
     """
 
     values: Callable[[NDArray[np.float64]], NDArray[np.float64]] | Sequence[float] | str
-    file: str | None = None
+    file: str | Path | None = None
 
     def __post_init__(self) -> None:
         """Check the attributes."""

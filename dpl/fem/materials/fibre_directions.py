@@ -7,6 +7,7 @@ sheet may be left out: it is z x f, or x where the fibre lies along z.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -95,7 +96,7 @@ class FibreData(FibreDirections):
 
     fibre: str | Sequence[Sequence[float]] | Array
     sheet: str | Sequence[Sequence[float]] | Array | None = None
-    file: str | None = None
+    file: str | Path | None = None
 
     def __post_init__(self) -> None:
         """Check the attributes."""

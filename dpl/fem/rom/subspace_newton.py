@@ -12,6 +12,7 @@ import torch
 from scipy.linalg import lapack
 from torch import Tensor
 
+from dpl.fem.linear.krylov import scaled_norm
 from dpl.fem.problem import Evaluation, Problem
 from dpl.fem.rom.ecsw import Cubature, cubature
 from dpl.fem.rom.reduced_problem import refuse_follower_loads
@@ -338,14 +339,6 @@ class _Correction(NamedTuple):
 
     y: Array
     solve: Callable[[Array], Array]
-
-
-def scaled_norm(vector: Array) -> float:
-    """Return the Euclidean norm, without overflow or underflow of squares."""
-    largest = float(np.abs(vector).max(initial=0))
-    if not 0 < largest < math.inf:
-        return largest
-    return largest * float(np.linalg.norm(vector / largest))
 
 
 def _factorised(matrix: Array) -> Callable[[Array], Array]:

@@ -6,14 +6,14 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from dpl.fem import LinearSolver, Load, Newton
 from dpl.fem.linear.interface import Array
-from dpl.fem.linear.krylov import krylov_steps
+from dpl.fem.linear.krylov import krylov_steps, scaled_norm
 from dpl.fem.problem import Evaluation
-from dpl.fem.rom.subspace_newton import scaled_norm
+from dpl.fem.solvers.linear import LinearSolver
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load
 
 RTOL = 1e-2  # relative residual of iterative solves for an estimate [-]
-SUFFICIENT = 2e-3  # steps leave an error of 1e-3 in the modes, and about as much outside [-]
 PRODUCTS = 3  # largest number of products with the tangent
 REST = 0.25  # part of the correction, bounding the rest of it, at which the steps end [-]
 NEAR = 0.1  # relative residual below which negative curvature is that of the equilibrium [-]
