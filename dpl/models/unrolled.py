@@ -32,6 +32,7 @@ from dpl.system.checks import check_range
 from dpl.system.threads import on_threads
 
 FEW = 8  # loads at which the error outside the modes is measured
+LARGER = 3.0  # ratio of a measured to a stored error up to which both are plausible
 CELL_STATES = 256  # states at which the cells of a correction are chosen
 MAX_SIZE = 100_000  # of rank, cells and stages
 # buffers and axes with the numbers of modes, cells, maps, and modes and cells of Newton's method
@@ -89,7 +90,7 @@ class Unrolled(StoredBuffers):
         newton_cells: Cells of its tangent, (C,).
         newton_weights: Their weights, (C,).
         outside_error: Largest relative error that it left at held-out samples, (). `correction`
-            takes the error that it measures at a few loads if that is larger.
+            takes the error that it measures at a few loads if that is `LARGER` times as large.
         fitted: True after `fit`, ().
     """
 
@@ -337,7 +338,8 @@ class Unrolled(StoredBuffers):
         solver = SubspaceNewton(problem, vectors, cells)
         guesses = self(load.force, *((load.parameters,) if self.extra_inputs else ()))
         measured = remaining_error(solver, self.scene.linear, load, guesses)
-        return replace(solver, outside_error=max(float(self.outside_error), measured))
+        stored = float(self.outside_error)  # of more loads, by their solutions
+        return replace(solver, outside_error=stored if measured <= LARGER * stored else measured)
 
     def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
         """Return Newton's method in the first modes; see `Correctable`.
