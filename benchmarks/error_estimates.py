@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import numpy as np
@@ -32,7 +33,7 @@ from dpl.models import FCNN, PODNet, Unrolled
 from dpl.training import MSE, Muon, RMSELoss, Surrogate
 
 IN_RANGE, TWICE = "in range", "twice the range"
-CALLS: Mapping[str, Mapping[str, float]] = {
+CALLS: Mapping[str, Mapping[str, Any]] = {
     "": {},
     "error=1e-2": {"error": 1e-2},
     "error=1e-3": {"error": 1e-3},
@@ -264,7 +265,8 @@ def estimates(
 def measured(sim: Simulator, samples: Sample, options: Mapping[str, float]) -> Iterator[Estimate]:
     """Yield true and estimated errors of answers to solved loads; the names are empty."""
     for load, exact in zip(samples.load.unbatch(), samples.displacement, strict=True):
-        answer = sim(**{k: v[0] for k, v in sim.scene.si_inputs(load).items()}, **options)
+        inputs: dict[str, Any] = {k: v[0] for k, v in sim.scene.si_inputs(load).items()}
+        answer = sim(**inputs, **options)
         error = float((answer.displacement / sim.scene.length - exact).norm() / exact.norm())
         yield Estimate("", "", "", "", answer.method, error, answer.error)
 
@@ -308,7 +310,9 @@ def summarised(found: Sequence[Estimate]) -> list[Row]:
                 count=len(members),
                 unknown=len(ratios) - len(finite),
                 error=float(np.median(errors)) if len(errors) else math.nan,
-                **dict(zip(("p5", "median", "p95"), map(float, quantiles), strict=True)),
+                p5=float(quantiles[0]),
+                median=float(quantiles[1]),
+                p95=float(quantiles[2]),
                 least=float(said.min()) if len(said) else math.nan,
                 missed=int((said < LEAST).sum()),
             )
