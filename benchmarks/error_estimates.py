@@ -174,9 +174,9 @@ def softened(scene: Scene, count: int, seed: int = 0) -> dict[str, Sample]:
     """Return solved loads that may soften the body, by name: compressed, twisted and pinched.
 
     The forces on the face of largest x act against x, about x, or squeeze the outer half along z.
-    Axial forces are 0.3 to 0.98 times the critical one; the others deflect the body linearly by
-    0.04 to 0.4 L. A force across, of random direction, deflects it linearly by 4e-6 to 0.04 L.
-    Loads without a stable solution are left out.
+    Compression and squeezing are 0.3 to 0.98 times the critical load; torsion deflects the body
+    linearly by 0.04 to 0.4 L. A force across, of random direction, deflects it linearly by 4e-6 to
+    0.04 L. Loads without a stable solution are left out.
 
     Args:
         scene: The scene.
@@ -199,7 +199,7 @@ def softened(scene: Scene, count: int, seed: int = 0) -> dict[str, Sample]:
     for name, force in kinds.items():
         force = force / _deflection(scene, force)
         sizes = rng.uniform(0.04, 0.4, count)
-        if name == "compressed":
+        if name != "twisted":
             sizes = rng.uniform(0.3, 0.98, count) * _critical(scene, force)
         loads = []
         for size, small in zip(sizes, 10 ** rng.uniform(-5, -1, count), strict=True):
@@ -207,7 +207,7 @@ def softened(scene: Scene, count: int, seed: int = 0) -> dict[str, Sample]:
             across[end, 1:] = torch.from_numpy(rng.standard_normal(2))
             loads.append(size * force + 0.4 * small * across / _deflection(scene, across))
         samples = solved(scene, Load(torch.stack(loads), torch.ones(count).double()))
-        stable = [_is_stable(scene, u) for u in samples.displacement.split(1)]
+        stable = [_is_stable(scene, u[None]) for u in samples.displacement]
         found[name] = Sample(*(column[stable] for column in samples))
     return found
 

@@ -20,7 +20,7 @@ from rich.table import Table
 from benchmarks import generation as ways
 from benchmarks import peers
 from dpl import Scene, config
-from dpl.evaluation.tables import machine, read, write, write_machine
+from dpl.evaluation.tables import machine, power, read, write, write_machine
 from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed_backends
 from dpl.fem.linear import BACKENDS
 from dpl.system.threads import one_thread
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 CONSOLE = Console(width=150)
 CASES = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
-    *("discretisation", "sizes", "modes", "laws", "deflections", "latency", "local"),
+    *("discretisation", "sizes", "modes", "laws", "deflections", "latency", "local", "newton"),
 )
 FIGURES = "figures"  # the case that draws the rows in `folder` again
 
@@ -266,6 +266,37 @@ def latency(cfg: DictConfig, backends: list[str]) -> None:
     write(calls, Path(cfg.folder) / "latency.csv")
     write(rates, Path(cfg.folder) / "throughput.csv")
     write_machine(Path(cfg.folder) / "latency.json")
+
+
+def newton(cfg: DictConfig, backends: list[str]) -> None:
+    """Write the times of all runs below a folder to tolerances, beside those of Newton's method.
+
+    Raises:
+        ConfigError: No folder is named, or it contains no runs.
+    """
+    from benchmarks import run_latency
+    from dpl.inference import Simulator
+
+    folders = sorted(path.parent for path in Path(cfg.run or "").glob("**/config.yaml"))
+    if cfg.run is None or not folders:
+        raise config.ConfigError(f"run = {cfg.run} must name a folder of runs for cases=[newton]")
+    rows = []
+    table = Table("one load, one thread", *("tol", "p50 [ms]", "p99 [ms]", "Newton", "p99"))
+    table.add_column("ratios")
+    table.add_column("methods")
+    for folder in folders:
+        simulator = Simulator(config.load_run(folder)[1])
+        load = simulator.scene.loads.sample((0, 2), range(cfg.samples))
+        name = str(folder.relative_to(cfg.run))
+        for row in run_latency.against_newton(name, simulator, load, repeats=cfg.repeats):
+            rows.append(row)
+            times = (row.p50, row.p99, row.newton_p50, row.newton_p99)
+            ratios = f"{row.p50 / row.newton_p50:.2f} {row.p99 / row.newton_p99:.2f}"
+            texts = (f"{time:.1f}" for time in times)
+            table.add_row(row.run, power(row.tol), *texts, ratios, row.methods)
+    CONSOLE.print(table)
+    write(rows, Path(cfg.folder) / "against_newton.csv")
+    write_machine(Path(cfg.folder) / "against_newton.json")
 
 
 def local(cfg: DictConfig, backends: list[str]) -> None:

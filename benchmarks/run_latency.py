@@ -2,19 +2,22 @@
 
 import statistics
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from dpl.evaluation import latency
 from dpl.evaluation.tables import power
-from dpl.fem import Load
+from dpl.fem import Load, solve
 from dpl.inference import Simulator
-from dpl.system.threads import available_cores, limited_threads
+from dpl.system.threads import available_cores, limited_threads, one_thread
 
 BATCHES = (1, 8, 64, 256)  # loads that are predicted by one call
+TOLS = (1e-3, 1e-6)  # of calls that are compared with Newton's method [-]
 OPTIONS = (  # of calls of the simulator
     {"error": 1e-3}, {"tol": 1e-3}, {"tol": 1e-6},
     *({"tol": 1e-8, "budget_ms": budget} for budget in (10.0, 20.0, 50.0, 100.0)),
@@ -51,6 +54,63 @@ class Throughput:
     batch: int
     threads: int
     loads_per_second: float
+
+
+@dataclass(frozen=True)
+class AgainstNewton:
+    """Wall times of calls with a tolerance and of Newton's method from rest, on one thread.
+
+    Attributes:
+        run: Name of the run.
+        tol: Relative residual of the result [-].
+        loads: Number of different loads.
+        p50, p99: Median and 99th percentile of the calls [ms].
+        newton_p50, newton_p99: The same of the reference solver with the same tolerance [ms].
+        methods: Number of answers of each method, as text.
+    """
+
+    run: str
+    tol: float
+    loads: int
+    p50: float
+    p99: float
+    newton_p50: float
+    newton_p99: float
+    methods: str
+
+
+def against_newton(
+    run: str, simulator: Simulator, load: Load, *, repeats: int = 3
+) -> Iterator[AgainstNewton]:
+    """Yield the times of calls and of Newton's method, which alternate.
+
+    Args:
+        run: Name of the run.
+        simulator: The simulator.
+        load: The loads.
+        repeats: Number of timed pairs for each load, of which the medians count.
+    """
+    scene = simulator.scene
+    for tol in TOLS:
+        newton = replace(scene.newton, tol=tol)
+        times, methods = [], Counter[str]()
+        for single in load.unbatch():
+            inputs: dict[str, Any] = scene.si_inputs(single)
+            pairs = []
+            for _ in range(repeats + 1):
+                begin = time.perf_counter()
+                answer = simulator(**inputs, tol=tol)
+                middle = time.perf_counter()
+                with one_thread(), torch.inference_mode():
+                    solve(newton, single)
+                pairs.append((middle - begin, time.perf_counter() - middle))
+            times.append(np.median(pairs[1:], axis=0))
+            methods.update(answer.method)
+        p50, p99 = (1e3 * np.quantile(times, share, axis=0) for share in (0.5, 0.99))
+        words = ", ".join(f"{name} {count}" for name, count in methods.most_common())
+        yield AgainstNewton(
+            run, tol, len(times), *map(float, (p50[0], p99[0], p50[1], p99[1])), words
+        )
 
 
 def call_times(simulator: Simulator, load: Load, *, repeats: int = 1) -> Iterator[CallTime]:

@@ -24,6 +24,7 @@ from dpl.fem import (
 )
 from dpl.fem.identity import plain, sha256_of
 from dpl.fem.linear.backends import factorisation_work
+from dpl.fem.solvers.corotational import CorotationalPreconditioner
 from dpl.fem.solvers.solution import as_column
 
 CORRECTOR_STREAM = 6  # stream of the loads on which the corrector is chosen
@@ -36,6 +37,7 @@ CELLS = {  # scikit-fem's names of shapes and those of bodies, in the plural
     "Triangular": "triangles",
 }
 MAX_MEAN_STEPS = 8  # of conjugate gradients, on average, with a factor that is near the tangent
+SOFTENED = 0.5  # eigenvalue over that at rest below which a load softens the body [-]
 MIN_FACTORISATION_WORK = 6e7  # multiply-adds that take as long as conjugate gradients in Newton
 
 
@@ -126,13 +128,29 @@ class Scene:
         It is on compact bodies, seldom on thin ones. The mean number of steps of conjugate
         gradients decides.
         """
-        loads = self.loads.sample((0, CORRECTOR_STREAM), range(3)).unbatch()
-        steps = []
-        for load in loads:
-            displacement = solve(self.solver, load).displacement
-            preconditioner = self.linear.with_parameters(load.parameters).corotational
-            steps.append(preconditioner.count_iterations(displacement))
+        steps = [factor.count_iterations(u) for factor, u in self._typical_states]
         return sum(steps) <= MAX_MEAN_STEPS * len(steps)
+
+    @cached_property
+    def is_softened(self) -> bool:
+        """Whether a random load softens the body: an eigenvalue of the tangent is far below K(0)'s.
+
+        The eigenvalues are relative to K(0) in the rotated frames of the nodes.
+        """
+        values = (factor.smallest_ritz_value(u) for factor, u in self._typical_states)
+        return min(values) < SOFTENED
+
+    @cached_property
+    def _typical_states(self) -> list[tuple[CorotationalPreconditioner, Tensor]]:
+        """Corotated factor of K(0) and equilibrium (1, N, D) [-] of a few random loads."""
+        loads = self.loads.sample((0, CORRECTOR_STREAM), range(3)).unbatch()
+        return [
+            (
+                self.linear.with_parameters(load.parameters).corotational,
+                solve(self.solver, load).displacement,
+            )
+            for load in loads
+        ]
 
     @property
     def length(self) -> float:

@@ -5,7 +5,8 @@ cases=[generation], cases=[sizes], cases=[modes] (time of the eigenmodes), cases
 several laws and with fibres); errors of other meshes: cases=[discretisation]; displacements of the
 test loads: cases=[deflections] count=100;
 latency and throughput of a trained run: cases=[latency] run=runs/mine; loads on small areas:
-cases=[local] run=runs/mine count=250.
+cases=[local] run=runs/mine count=250; times to tolerances of all runs below a folder, beside those
+of Newton's method: cases=[newton] run=runs.
 """
 
 from collections.abc import Sequence

@@ -9,6 +9,7 @@ from torch import Tensor
 from dpl.fem import Solution
 from dpl.fem.problem import Evaluation
 from dpl.fem.solvers import check_tol
+from dpl.fem.solvers.error_estimate import PRODUCTS
 from dpl.inference.arguments import as_number
 from dpl.scene import Scene
 
@@ -50,6 +51,7 @@ class Request(NamedTuple):
         error: Estimated relative error of the result [-]; None: not requested.
         warm: Whether the last displacement is a guess too.
         begin: Time at which the computation began [s].
+        products: Largest number of products with the tangent in an estimated error.
     """
 
     tol: float | None
@@ -57,6 +59,7 @@ class Request(NamedTuple):
     error: float | None
     warm: bool
     begin: float = 0.0
+    products: int = PRODUCTS
 
     @classmethod
     def checked(cls, tol: Any, budget_ms: Any, error: Any, *, warm: bool) -> Self:

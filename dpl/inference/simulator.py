@@ -23,7 +23,7 @@ from dpl.fem import (
 )
 from dpl.fem.mesh.regions import Region
 from dpl.fem.solvers import concatenate
-from dpl.fem.solvers.error_estimate import PRODUCTS, nearest
+from dpl.fem.solvers.error_estimate import MANY_PRODUCTS, PRODUCTS, nearest
 from dpl.inference.answer import Answer, answer_like, summarise
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.grasp import GraspAnswer, Gripper
@@ -41,7 +41,7 @@ ERROR = 1e-3  # estimated relative error above which they are made [-]
 POOR_STREAM = 9_003  # of the loads by which the predictions are judged
 PACE_DECAY = 0.9  # of a time from call to call
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
-MAX_RESIDUAL = 0.1  # above it the error outside of the modes is not that of the training [-]
+MAX_RESIDUAL = 1.0  # above it the error outside of the modes is not that of the training [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 
 
@@ -88,6 +88,7 @@ class Simulator:
         self._first_pace = 0.0  # time of the start of the hybrid and its first iteration [s]
         self._estimate_time = 0.0  # time of an estimate of the error [s]
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
+        self.scene.is_softened  # noqa: B018
         self.scene.linear.reference.corotational  # noqa: B018  # so is the factor of the estimate
 
     @classmethod
@@ -168,7 +169,8 @@ class Simulator:
             members = load.unbatch(), predictions, places.split()
             for single, prediction, place in zip(*members, strict=True):
                 begin = time.perf_counter() - shared
-                best = self._solve(single, prediction, place, request._replace(begin=begin))
+                own = request._replace(begin=begin, products=self._products(place, request))
+                best = self._solve(single, prediction, place, own)
                 if stability:
                     best = best._replace(state=self._with_stability(single, best.state))
                 self._before = single.parameters, best.state.displacement
@@ -293,6 +295,15 @@ class Simulator:
         state = state._replace(status=status, load_factor=ended.load_factor)
         return self._with_error(load, best._replace(state=state), request)
 
+    def _products(self, place: RangeCheck, request: Request) -> int:
+        """Return the products with the tangent in an estimate, which softening needs.
+
+        Predictions in a range without softening are estimated without products.
+        """
+        if request.is_more_than_prediction or not place.inside or self.scene.is_softened:
+            return PRODUCTS if self.scene.is_compact else MANY_PRODUCTS
+        return 0
+
     def _with_error(self, load: Load, candidate: Candidate, request: Request) -> Candidate:
         """Return a solution with its estimated error.
 
@@ -306,7 +317,10 @@ class Simulator:
         if known <= (SUFFICIENT if request.error is None else request.error):
             return candidate._replace(error=known)
         begin, state = time.perf_counter(), candidate.state
-        found = estimate_error(self.scene.linear, load, state.displacement, candidate.evaluation)
+        found = estimate_error(
+            self.scene.linear, load, state.displacement, candidate.evaluation,
+            products=request.products,
+        )  # fmt: skip
         self._estimate_time = time.perf_counter() - begin
         if found.is_indefinite:
             state = state.unstable()
@@ -337,7 +351,9 @@ class Simulator:
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
             linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
             yield _evaluated("linear", problem, linear, load, tol)
-        start = nearest(self.scene.newton, load, guesses) if guesses else None
+        start = guesses[0] if guesses else None
+        if len(guesses) > 1:
+            start = nearest(self.scene.newton, load, guesses)
         for state in self._iterates(load, start, tol):
             if int(state.iterations):
                 now = time.perf_counter()
@@ -374,7 +390,7 @@ class Simulator:
         if error is None:
             error = candidate.error_in_modes + candidate.error_outside
         if error > FAR and candidate.error is None:
-            products = 0 if self.scene.is_compact else PRODUCTS
+            products = 0 if self.scene.is_compact else MANY_PRODUCTS
             error = estimate_error(
                 self.scene.linear, load, candidate.state.displacement, candidate.evaluation,
                 products=products,
@@ -427,7 +443,7 @@ class Simulator:
             iterations=taken + state.iterations, from_guess=True, evaluation=state.evaluation,
         )  # fmt: skip
         outside = self.newton.outside_error  # 0 if it is not known
-        in_range = bool(place.is_known & ~place.outside & (solution.residual < MAX_RESIDUAL))
+        in_range = bool(place.inside & (solution.residual < MAX_RESIDUAL))
         return Candidate(
             "corrected" if taken + state.iterations else "network",
             solution,

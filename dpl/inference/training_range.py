@@ -40,6 +40,11 @@ class RangeCheck(NamedTuple):
         """Whether the load family can tell if the load is in range, (B,)."""
         return ~self.out_of_span.isnan()
 
+    @property
+    def inside(self) -> Tensor:
+        """Whether the load is known to be in range, (B,)."""
+        return self.is_known & ~self.outside
+
     def split(self) -> list[Self]:
         """Return the positions one by one, B = 1."""
         if len(self.outside) == 1:

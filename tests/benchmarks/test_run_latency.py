@@ -43,6 +43,14 @@ def test_every_call_is_timed_with_every_load(simulator, batch, monkeypatch):
     assert min(given.count(tol) for tol in (None, 1e-3, 1e-6)) >= 12
 
 
+def test_calls_to_tolerances_alternate_with_newton(simulator, batch):
+    rows = list(run_latency.against_newton("mine", simulator, batch.load, repeats=1))
+    assert [row.tol for row in rows] == [1e-3, 1e-6]
+    assert {row.loads for row in rows} == {12}
+    assert all(0 < row.p50 <= row.p99 and 0 < row.newton_p50 <= row.newton_p99 for row in rows)
+    assert all(row.methods == "full Newton 12" for row in rows), "an untrained network is far off"
+
+
 def test_loads_are_listed_by_their_number_of_steps(simulator, batch, monkeypatch):
     call = Simulator.__call__
 

@@ -335,9 +335,9 @@ def test_the_error_in_modes_counts_in_range_only_and_saves_the_correction(
     assert unknown(forces[0]).error < 1e-6
     assert len(seen) == 4
     noisy = simulator_of(scene, 1.0, newton=softest_mode(scene, outside_error=1e-4))
-    noise = 1e-3 * torch.randn(scene.problem.shape, generator=torch.Generator().manual_seed(0))
+    noise = 6e-3 * torch.randn(scene.problem.shape, generator=torch.Generator().manual_seed(0))
     predict = noisy.surrogate.predict
     noisy.surrogate.predict = lambda load: predict(load) + noise * scene.problem.free
     answer = noisy(forces[0])
-    assert answer.residual > 0.1
-    assert len(seen) == 5, "the residual shows an error that the modes do not contain"
+    assert answer.residual > 1
+    assert len(seen) > 4, "the residual shows an error that the modes do not contain"

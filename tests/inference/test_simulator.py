@@ -16,7 +16,8 @@ import dpl.inference.request as request_module
 import dpl.inference.simulator as simulator_module
 from dpl.config import build
 from dpl.fem import Status, SubspaceNewton, solve
-from dpl.inference import Hybrid, Simulator, nearest
+from dpl.fem.solvers.error_estimate import nearest
+from dpl.inference import Hybrid, Simulator
 from dpl.models import CNN, FCNN, GNN
 from dpl.training import MSE, Surrogate
 

@@ -10,7 +10,6 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import eigvalsh_tridiagonal
 from scipy.sparse import csr_matrix
 
 from dpl.fem.linear.interface import (
@@ -143,7 +142,8 @@ def krylov_steps(product: Map, precondition: Map, right: Array) -> Iterator[Kryl
             return
         length = rz / curvature
         diagonal.append(1 / length + carried)
-        ritz = float(eigvalsh_tridiagonal(diagonal, off_diagonal)[0])
+        tridiagonal = np.diag(diagonal) + np.diag(off_diagonal, -1)  # the lower triangle is read
+        ritz = float(np.linalg.eigvalsh(tridiagonal)[0])
         x = x + length * direction
         residual -= length * image
         z = precondition(residual)

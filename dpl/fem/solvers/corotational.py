@@ -12,11 +12,11 @@ import numpy as np
 from numba import float64, int64, njit, void
 from numba.types import Array as Typed
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 from torch import Tensor
 
 from dpl.fem.linear.interface import Array, Factor, SingularMatrix, SymmetricProduct
-from dpl.fem.linear.krylov import conjugate_gradients
+from dpl.fem.linear.krylov import conjugate_gradients, smallest_ritz_value
 from dpl.fem.problem import Problem
 
 MAX_POLAR_ITER = 20  # of a polar decomposition; near a rotation it takes three iterations
@@ -65,8 +65,7 @@ class CorotationalPreconditioner:
 
         The right-hand side is random; the result is at most `max_iter`.
         """
-        tangent = self.problem.linearise(displacement).tangent[0].numpy()
-        product = SymmetricProduct(self.problem.pattern, tangent)
+        product = self._tangent(displacement)
         right = np.random.default_rng(0).standard_normal(self.problem.pattern.size)
         factor, calls = self.at(displacement), []
 
@@ -78,6 +77,15 @@ class CorotationalPreconditioner:
             conjugate_gradients(product, apply, right, rtol, max_iter)
             return len(calls)
         return max_iter
+
+    def smallest_ritz_value(self, displacement: Tensor) -> float:
+        """Return the smallest Ritz value of this inverse times the tangent at (1, N, D) [-]."""
+        product, factor = self._tangent(displacement), self.at(displacement)
+        return smallest_ritz_value(product, factor.apply, self.problem.pattern.size)
+
+    def _tangent(self, displacement: Tensor) -> SymmetricProduct:
+        values = self.problem.linearise(displacement).tangent[0].numpy()
+        return SymmetricProduct(self.problem.pattern, values)
 
     @cached_property
     def _cell_means(self) -> tuple[Array, Array, NDArray[np.int64]]:
@@ -118,11 +126,16 @@ class CorotatedFactor:
 
     def apply(self, right: Array) -> Array:
         """Return R M R^T right, (n,), M the inverse of K(0) or its preconditioner."""
-        return self.matrix @ self.factor.apply(self.matrix.T @ right)
+        return self.matrix @ self.factor.apply(self._transposed @ right)
 
     def solve(self, right: Array, rtol: float) -> Array:
         """Return R K(0)^-1 R^T right, (n,), to a relative residual, see `Factor.solve`."""
-        return self.matrix @ self.factor.solve(self.matrix.T @ right, rtol)
+        return self.matrix @ self.factor.solve(self._transposed @ right, rtol)
+
+    @cached_property
+    def _transposed(self) -> csc_array:
+        """R^T at free degrees of freedom, (n, n)."""
+        return self.matrix.T
 
 
 # One explicit signature each: numba's cache can mix up the machine code of several signatures of a

@@ -15,9 +15,11 @@ from dpl.fem.solvers.solution import Load
 
 RTOL = 1e-2  # relative residual of iterative solves for an estimate [-]
 PRODUCTS = 3  # largest number of products with the tangent
-REST = 0.25  # part of the correction, bounding the rest of it, at which the steps end [-]
+MANY_PRODUCTS = 30  # the same on thin bodies, where M is not near the inverse of the tangent
+REST = 0.1  # part of the correction, bounding the rest of it, at which the steps end [-]
 NEAR = 0.1  # relative residual below which negative curvature is that of the equilibrium [-]
 DOUBT = 3.0  # factor of the estimate where negative curvature is that of spurious stresses
+LINEAR = 1e-3  # relative correction up to which R is linear along it [-]
 DIFFERENCE = 1e-5  # change of u, relative to u, by which products are computed [-]
 
 
@@ -50,17 +52,18 @@ def estimate_error(
     ||z|| / t, with z = M (R - K(u) x) and the smallest eigenvalue t of M K(u), which the smallest
     Ritz value approximates from above. t is small where the load softens the body; Newton's
     correction is then too short. With s = min(t, 1) the estimate is (2 - s) (||x|| + ||z|| / s)
-    over ||u||. Steps are made until ||z|| / s is at most `REST` times ||x||.
+    over ||u||. Steps are made until ||z|| / s is at most `REST` times ||x||. Above `LINEAR`, the
+    residual that the correction leaves decides: ||z|| is then at least ||M R(u + x)||.
 
     A step costs one residual, which differs by K(u) times its direction, and one solve with the
     stored factor of K(0). If the law has parameters, this is the factor at the centre of their
     ranges, so that no load needs a new one.
 
-    The estimate is infinite if an element is inverted, if u is not finite, and if u is zero and not
-    in equilibrium. The correction is None in the first two cases. If a step finds negative
-    curvature, the estimate is infinite where the relative residual is below `NEAR`: an equilibrium
-    near u is unstable or near a critical load. Where the residual is larger, stresses of the error
-    itself cause it, and the estimate is `DOUBT` ||M R|| / ||u||.
+    The estimate is infinite if an element is inverted at u or by the correction, if u is not
+    finite, and if u is zero and not in equilibrium. The correction is None if u is inverted or not
+    finite. If a step finds negative curvature, the estimate is infinite where the relative residual
+    is below `NEAR`: an equilibrium near u is unstable or near a critical load. Where the residual
+    is larger, stresses of the error itself cause it, and the estimate is `DOUBT` ||M R|| / ||u||.
 
     Source: Deuflhard (2011), Newton Methods for Nonlinear Problems, section 3.3 (corrections as
     error estimates); Mueller, Dorsey, McMillan, Jagnow, Cutler (2002), Stable real-time
@@ -102,6 +105,12 @@ def estimate_error(
         rest = scaled_norm(z) / least
         if size == 0 or k == products or rest <= REST * made:
             break
+    if k and float(unit * (made + rest)) > LINEAR * size:
+        better = problem.evaluate(displacement + correction)
+        left = problem.restrict((load.force - better.internal)[0]) / unit
+        if not bool(better.volume_ratio > 0):
+            return ErrorEstimate(math.inf, correction)
+        rest = max(rest, scaled_norm(inverse.solve(left, RTOL)) / least)
     distance = (2 - least) * (made + rest)
     if size == 0:
         return ErrorEstimate(math.inf if distance else 0.0, correction)
