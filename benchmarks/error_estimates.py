@@ -262,7 +262,7 @@ def estimates(
                     yield replace(found, body=body, prediction=name, loads=title, call=call)
 
 
-def measured(sim: Simulator, samples: Sample, options: Mapping[str, float]) -> Iterator[Estimate]:
+def measured(sim: Simulator, samples: Sample, options: Mapping[str, Any]) -> Iterator[Estimate]:
     """Yield true and estimated errors of answers to solved loads; the names are empty."""
     for load, exact in zip(samples.load.unbatch(), samples.displacement, strict=True):
         inputs: dict[str, Any] = {k: v[0] for k, v in sim.scene.si_inputs(load).items()}

@@ -109,7 +109,7 @@ def against_newton(
         p50, p99 = (1e3 * np.quantile(times, share, axis=0) for share in (0.5, 0.99))
         words = ", ".join(f"{name} {count}" for name, count in methods.most_common())
         yield AgainstNewton(
-            run, tol, len(times), *map(float, (p50[0], p99[0], p50[1], p99[1])), words
+            run, tol, len(times), float(p50[0]), float(p99[0]), float(p50[1]), float(p99[1]), words
         )
 
 
