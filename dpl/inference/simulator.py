@@ -298,11 +298,14 @@ class Simulator:
     def _products(self, place: RangeCheck, request: Request) -> int:
         """Return the products with the tangent in an estimate, which softening needs.
 
-        Predictions in a range without softening are estimated without products.
+        Displacements of a compact body in a range without softening are estimated without products,
+        and predictions of a thin one, since many products would take longer than the prediction.
         """
-        if request.is_more_than_prediction or not place.inside or self.scene.is_softened:
-            return PRODUCTS if self.scene.is_compact else MANY_PRODUCTS
-        return 0
+        is_compact = self.scene.is_compact
+        is_usual = place.inside and not self.scene.is_softened
+        if is_usual and (is_compact or not request.is_more_than_prediction):
+            return 0
+        return PRODUCTS if is_compact else MANY_PRODUCTS
 
     def _with_error(self, load: Load, candidate: Candidate, request: Request) -> Candidate:
         """Return a solution with its estimated error.
