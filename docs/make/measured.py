@@ -178,26 +178,23 @@ PARTS = (
         "The test load with the largest displacement.",
     ),
     Part(
+        "against_newton",
+        "Calls to tolerances beside Newton's method",
+        "python scripts/benchmark.py cases=[newton] run=runs folder=benchmarks/results",
+        "Calls of the simulator and Newton's method from rest alternate, on one thread.",
+    ),
+    Part(
         "error_estimates",
         "Estimated over true errors",
         "python scripts/error_estimates.py folder=benchmarks/results",
-        "Quantiles of the ratio, for predictions of models of 96 loads, on four bodies.",
+        "Quantiles of the ratio, for answers of models of 96 loads, on four bodies.",
         tabulated=False,
     ),
     Part(
         "error_estimates_loads",
         "Estimated and true errors",
         "python scripts/error_estimates.py folder=benchmarks/results",
-        "One row for each load and prediction of the file before.",
-        tabulated=False,
-    ),
-    Part(
-        r"error_estimates_(beam_\w+?)(?:_loads)?",
-        "Estimated over true errors on `{0}`",
-        "python scripts/error_estimates.py run=runs/{0} name=error_estimates_{0} test=100 "
-        "folder=benchmarks/results",
-        "Predictions of the trained runs of an experiment for its test loads, and for these loads "
-        "doubled.",
+        "One row for each answer of the file before.",
         tabulated=False,
     ),
     Part(

@@ -325,7 +325,7 @@ class Simulator:
             products=request.products,
         )  # fmt: skip
         self._estimate_time = time.perf_counter() - begin
-        if found.is_indefinite:
+        if found.is_indefinite and int(state.negative_pivots) < 0:
             state = state.unstable()
         error = max(candidate.error_in_modes, found.error)
         return candidate._replace(state=state, error=error, correction=found.correction)
@@ -341,16 +341,17 @@ class Simulator:
         """
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
         self._pace = self._first_pace
-        guesses = []
+        starts = []
         if prediction is not None:
             for first in self._predictions(load, prediction, place, request):
                 yield first  # the last one is the best
             if not request.is_more_than_prediction:
                 return
-            guesses = [] if self._is_far(load, first) else [first.state.displacement]
+            starts.append(first)
         clock = time.perf_counter()
         if request.warm and self._before and torch.equal(self._before[0], load.parameters):
-            guesses.append(self._before[1])
+            starts.append(_evaluated("last", problem, self._before[1], load, tol))
+        guesses = [one.state.displacement for one in starts if not self._is_far(load, one)]
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
             linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
             yield _evaluated("linear", problem, linear, load, tol)
@@ -413,6 +414,8 @@ class Simulator:
         if request.error is not None or (self.newton is not None and request.is_for_error):
             last = self._with_error(load, last, request)
         yield last
+        if self.newton is None:
+            return
         sufficient = SUFFICIENT if request.error is None else request.error
         while last.correction is not None and last.known_error > sufficient:
             taken = int(last.state.iterations) + 1
