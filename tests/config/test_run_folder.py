@@ -18,7 +18,15 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
-from benchmarks.commands import benchmark, results, soak, stress, verify
+from benchmarks.commands import (
+    benchmark,
+    convergence,
+    pareto,
+    results,
+    soak,
+    stress,
+    verify,
+)
 from dpl.commands import cli
 from dpl.config import ConfigError, build, resume, run_folder, validation
 from dpl.training import checkpoints
@@ -229,7 +237,8 @@ BAD_COMMANDS = {
 
 
 KEYS = {
-    one.__name__.rpartition(".")[2]: one.KEYS for one in (benchmark, results, soak, stress, verify)
+    one.__name__.rpartition(".")[2]: one.KEYS
+    for one in (benchmark, convergence, pareto, results, soak, stress, verify)
 }
 
 
