@@ -231,7 +231,7 @@ BAD_COMMANDS = {
     "stress cases=T2": r"cases = 'T2' must be a list, each a text or null",
     "convergence max_far_iterations=0": r"max_far_iterations = 0 must lie between 1 and",
     "soak folder=. minutes=0": r"minutes = 0 must lie between 0\.01 and",
-    "view run=x profile={_target_:builtins.dict}": r"profile = .* must be true or false",
+    "view run=x trust={_target_:builtins.dict}": r"trust = .* must be true or false",
     "verify cases=3": r"cases = 3 must be a list, each a text",
 }
 
