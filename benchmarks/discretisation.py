@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dpl.evaluation.pareto import Cells, Discretisation
+from benchmarks.pareto import Cells, Discretisation
 from dpl.fem import (
     BodyForce,
     Load,

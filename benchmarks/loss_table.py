@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from dpl.evaluation.methods import training_minutes
+from benchmarks.methods import training_minutes
 from dpl.evaluation.report import PREDICTION
 from dpl.training.metrics import median
 

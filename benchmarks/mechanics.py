@@ -20,12 +20,13 @@ from rich.table import Table
 from benchmarks import generation as ways
 from benchmarks import peers
 from dpl import Scene, config
-from dpl.evaluation.tables import machine, power, read, write, write_machine
+from dpl.evaluation.tables import machine, power, read, show, write, write_machine
 from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed_backends
 from dpl.fem.linear import BACKENDS
 from dpl.system.threads import one_thread
 
 if TYPE_CHECKING:
+    from benchmarks.frame_rate import FrameTimes
     from benchmarks.sizes import Size
 
 
@@ -33,6 +34,7 @@ CONSOLE = Console(width=150)
 CASES = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
     *("discretisation", "sizes", "modes", "laws", "deflections", "latency", "local", "newton"),
+    "frames",
 )
 FIGURES = "figures"  # the case that draws the rows in `folder` again
 
@@ -332,6 +334,32 @@ def local(cfg: DictConfig, backends: list[str]) -> None:
     stem = Path(cfg.folder) / f"local_loads_{Path(cfg.run).name}"
     write(rows, stem.with_suffix(".csv"))
     write_machine(stem.with_suffix(".json"))
+
+
+def frames(cfg: DictConfig, backends: list[str]) -> "list[FrameTimes]":
+    """Return the times of the frames of the page of a trained run; print latencies beside them.
+
+    Raises:
+        ConfigError: No run is named, or the extra `viewer` is not installed.
+    """
+    from dpl import load, viewer
+    from dpl.commands.view import require_viewer
+    from dpl.evaluation.timing import describe
+
+    if cfg.run is None:
+        raise config.ConfigError("run = null must name the trained run for cases=[frames]")
+    require_viewer()
+    from benchmarks import frame_rate
+
+    body, policy = viewer.Body(load(cfg.run)), viewer.AccessPolicy.bind("127.0.0.1", 0)
+    page = viewer.Page(body, policy, title=str(cfg.run), folder=Path(cfg.folder))
+    try:
+        rows, latencies = frame_rate.measure_frames(page)
+    finally:
+        page.close()
+    show(rows, "times per frame on the server, and frames received by a client")
+    CONSOLE.print(describe(latencies))
+    return rows
 
 
 def figures(cfg: DictConfig, backends: list[str]) -> None:

@@ -182,7 +182,7 @@ def append(session: Session, root: Path) -> None:
 
 def times(runs: Sequence[Run], root: Path, sessions: Sequence[Session]) -> list[RunTime]:
     """Return the wall times of the runs that the journal contains, and their sum."""
-    from dpl.evaluation.methods import training_minutes
+    from benchmarks.methods import training_minutes
 
     rows = []
     for run in runs:

@@ -7,8 +7,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from benchmarks.methods import Method
 from dpl import Sample, Scene
-from dpl.evaluation import Method, latency
+from dpl.evaluation import latency
 from dpl.evaluation.tables import read, write, write_machine
 from dpl.fem import Load, Newton, Status, solve
 from dpl.system.threads import one_thread

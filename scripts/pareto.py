@@ -1,6 +1,10 @@
 """Measure run time and error of all solvers: python scripts/pareto.py run=runs/beam_svk."""
 
+import sys
+from pathlib import Path
+
 if __name__ == "__main__":
-    from dpl.commands.pareto import main
+    sys.path.insert(0, str(Path(__file__).parents[1]))  # `benchmarks` is not installed
+    from benchmarks.commands.pareto import main
 
     main()

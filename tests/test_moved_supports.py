@@ -4,8 +4,8 @@ import pytest
 import torch
 from linear_solutions import BEAM, SUPPORTS
 
+from benchmarks.plain_newton import PlainNewton
 from dpl import Scene
-from dpl.evaluation.plain_newton import PlainNewton
 from dpl.fem import LinearSolver, Load, ModalLoads, NeoHookeanLn, Newton, Problem, solve
 from dpl.inference import Simulator
 from dpl.models import FCNN

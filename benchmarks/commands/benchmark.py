@@ -6,7 +6,8 @@ several laws and with fibres); errors of other meshes: cases=[discretisation]; d
 test loads: cases=[deflections] count=100;
 latency and throughput of a trained run: cases=[latency] run=runs/mine; loads on small areas:
 cases=[local] run=runs/mine count=250; times to tolerances of all runs below a folder, beside those
-of Newton's method: cases=[newton] run=runs.
+of Newton's method: cases=[newton] run=runs; frames of the page of a run: cases=[frames]
+run=runs/mine.
 """
 
 from collections.abc import Sequence

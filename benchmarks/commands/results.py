@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from benchmarks.commands import CONF
+from benchmarks.commands.pareto import METHODS, trained_methods
 from dpl import config
 from dpl.commands.cli import command
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from dpl.inference.hybrid import Predict
 
 KEYS = (
+    METHODS,
     (bool, "keep single"),
     (str, "runs"),
     (Sequence[str], "convergence"),
@@ -44,9 +46,7 @@ def main(cfg: DictConfig) -> None:
 
 def measure(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
-    from benchmarks import learning_curves, paper_tables
-    from dpl.commands.pareto import trained_methods
-    from dpl.evaluation import methods
+    from benchmarks import learning_curves, methods, paper_tables
     from dpl.evaluation.tables import show
 
     runs = config.load_runs(cfg.run, cfg.networks)

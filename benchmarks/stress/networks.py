@@ -7,6 +7,7 @@ from functools import cache, partial
 import torch
 from torch import Tensor
 
+from benchmarks.plain_newton import PlainNewton
 from benchmarks.stress.auditor import Auditor
 from benchmarks.stress.case import Case, LoadLevel, Outcome, classify, expect_error
 from benchmarks.stress.fixtures import MAX_TRACTION, YOUNG, as_load, end_traction
@@ -14,7 +15,6 @@ from benchmarks.stress.loads import AMPLITUDES, describe, level
 from benchmarks.verification.bodies import paper_beam
 from benchmarks.verification.report import Row
 from dpl import Scene
-from dpl.evaluation.plain_newton import PlainNewton
 from dpl.fem import (
     AndersonSolver,
     LinearSolver,

@@ -17,25 +17,12 @@ from dpl.version import install
 @command("view")
 def main(cfg: DictConfig) -> None:
     """Serve the page until Ctrl-C; with `animation` write an animation instead."""
-    from dpl.evaluation.tables import show
-    from dpl.evaluation.timing import describe
-
     if cfg.animation:
         write_animation(load_body(cfg), Path(cfg.animation))
         return
     require_viewer()
     policy = bind(cfg)
-    if not cfg.profile:
-        serve(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
-    from dpl.viewer.frame_rate import measure_frames
-
-    page = viewer.Page(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
-    try:
-        rows, latencies = measure_frames(page)
-        show(rows, "times per frame on the server, and frames received by a client")
-        print(describe(latencies))
-    finally:
-        page.close()
+    serve(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
 
 
 def require_viewer() -> None:

@@ -1,4 +1,4 @@
-"""Errors and run times of solvers, and Newton started from predictions."""
+"""Errors and run times of solvers."""
 
 from typing import TYPE_CHECKING
 
@@ -6,7 +6,6 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.evaluation.comparison import compare
-    from dpl.evaluation.methods import Method, corrected, pod_galerkin
     from dpl.evaluation.report import PREDICTION, evaluate
     from dpl.evaluation.timing import Latency, latencies, latency
 else:

@@ -105,9 +105,3 @@ def time_interleaved(
         name: (concatenate(solutions[name]), torch.tensor(times[name], dtype=torch.float64))
         for name in solvers
     }
-
-
-def time_iterates(solver: Solver, load: Load) -> list[tuple[float, Solution]]:
-    """Return all iterates of a solver, each with the wall time up to it [ms]."""
-    start = time.perf_counter()
-    return [(1e3 * (time.perf_counter() - start), state) for state in solver.iterate(load)]

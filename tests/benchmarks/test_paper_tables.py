@@ -6,9 +6,8 @@ import json
 import pytest
 import torch
 
-from benchmarks import paper_tables
+from benchmarks import methods, paper_tables
 from benchmarks.paper_tables import Result
-from dpl.evaluation import methods
 from dpl.evaluation.tables import read, write
 from dpl.fem import solve
 from dpl.models import PODNet

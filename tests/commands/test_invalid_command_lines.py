@@ -27,7 +27,7 @@ NONSENSE = {  # command line -> what the one line says
     "train fixed=null": r"^fixed = null: .* one of cylinder, plane, tag; ~fixed leaves it",
     "train fixed=3": r"^fixed = 3: .* one of cylinder, plane, tag$",
     "train +model=cnn": r"^model: an option is chosen already; write model=cnn$",
-    "train methods=default": r"^methods: this command has no such key",
+    "generate model=fcnn": r"^model: this command has no such key",
     "train model/part=cnn": r"^model/part: there is no such group",
     "train hydra/launcher=jobblib": r"^hydra/launcher = jobblib: .*pip install .*launch",
     "train hydra.swep.dir=3": r"^hydra\.swep\.dir: .*; did you mean hydra\.sweep\?$",

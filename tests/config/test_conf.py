@@ -27,7 +27,7 @@ MESHES = [
     pytest.param(name, marks=pytest.mark.slow) if name == "paper_beam" else name
     for name in options("mesh")
 ]
-WHOLE = ("experiment", "debug", "hparams_search", "methods")  # groups that set keys of others
+WHOLE = ("experiment", "debug", "hparams_search")  # groups that set keys of others
 NAMED = ("callbacks", "logger")  # groups whose options are calls by name
 PLAIN = ("paths", "extras")  # groups without calls
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name not in WHOLE)

@@ -18,7 +18,15 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
-from benchmarks.commands import benchmark, results, soak, stress, verify
+from benchmarks.commands import (
+    benchmark,
+    convergence,
+    pareto,
+    results,
+    soak,
+    stress,
+    verify,
+)
 from dpl.commands import cli
 from dpl.config import ConfigError, build, resume, run_folder, validation
 from dpl.training import checkpoints
@@ -223,13 +231,14 @@ BAD_COMMANDS = {
     "stress cases=T2": r"cases = 'T2' must be a list, each a text or null",
     "convergence max_far_iterations=0": r"max_far_iterations = 0 must lie between 1 and",
     "soak folder=. minutes=0": r"minutes = 0 must lie between 0\.01 and",
-    "view run=x profile={_target_:builtins.dict}": r"profile = .* must be true or false",
+    "view run=x trust={_target_:builtins.dict}": r"trust = .* must be true or false",
     "verify cases=3": r"cases = 3 must be a list, each a text",
 }
 
 
 KEYS = {
-    one.__name__.rpartition(".")[2]: one.KEYS for one in (benchmark, results, soak, stress, verify)
+    one.__name__.rpartition(".")[2]: one.KEYS
+    for one in (benchmark, convergence, pareto, results, soak, stress, verify)
 }
 
 

@@ -1,5 +1,6 @@
 """Run time against error of all iterates of solvers on the same loads."""
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -9,8 +10,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from dpl.evaluation.timing import WARM_UP, percentiles, time_iterates
-from dpl.fem import Load, Solver, solve
+from dpl.evaluation.timing import WARM_UP, percentiles
+from dpl.fem import Load, Solution, Solver, solve
 from dpl.scene import Sample
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, Surrogate
@@ -118,6 +119,12 @@ def points(
                 found.append(Point(*record, *percentiles(times), *errors))
             tick()
     return found
+
+
+def time_iterates(solver: Solver, load: Load) -> list[tuple[float, Solution]]:
+    """Return all iterates of a solver, each with the wall time up to it [ms]."""
+    start = time.perf_counter()
+    return [(1e3 * (time.perf_counter() - start), state) for state in solver.iterate(load)]
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dpl.evaluation.newton_starts import REFERENCE, Trial
+from benchmarks.newton_starts import REFERENCE, Trial
 from dpl.visualization import COLOURS, DPI
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from rich.progress import Progress
 
 import dpl
+from benchmarks.commands import CONF
 from dpl import config, fem, inference, models
 from dpl.commands.cli import command
 from dpl.evaluation import tables
@@ -16,14 +17,17 @@ from dpl.evaluation import tables
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from dpl.evaluation.methods import Method
-    from dpl.evaluation.pareto import Discretisation, Point
+    from benchmarks.methods import Method
+    from benchmarks.pareto import Discretisation, Point
+
+METHODS = (dict | None, "galerkin corrected")  # keys of `trained_methods`
+KEYS = (METHODS, (str | None, "discretisation"))
 
 
-@command("pareto")
+@command("pareto", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Measure all solvers and the networks of a folder of runs; write rows and a figure."""
-    from dpl.evaluation import pareto
+    from benchmarks import pareto
     from dpl.system.threads import available_cores
 
     others = _discretisations(cfg)
@@ -49,7 +53,7 @@ def main(cfg: DictConfig) -> None:
 
 def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
     """Return the errors of other meshes to draw; none without a file."""
-    from dpl.evaluation.pareto import Discretisation
+    from benchmarks.pareto import Discretisation
 
     if cfg.discretisation is None:
         return []
@@ -72,7 +76,7 @@ def _solvers(cfg: DictConfig) -> tuple["dpl.Scene", dict[str, "fem.Solver"], "dp
     """Return the scene of the runs, all solvers including their networks, and the test loads."""
     import torch
 
-    from dpl.evaluation import pareto
+    from benchmarks import pareto
 
     runs = config.load_runs(cfg.run, trust=cfg.trust)
     first, surrogate = next(iter(runs.values()))
@@ -105,7 +109,7 @@ def trained_methods(
     Raises:
         ConfigError: `galerkin` or `corrected` cannot be made for this scene and these samples.
     """
-    from dpl.evaluation import methods
+    from benchmarks import methods
 
     found: dict[tuple[str, str], Method] = {}
     if cfg.galerkin:

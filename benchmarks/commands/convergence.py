@@ -1,5 +1,7 @@
 """Newton from zero and from predictions: python scripts/convergence.py run=runs/beam_svk."""
 
+import math
+from collections.abc import Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -8,6 +10,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 from rich.progress import Progress
 
+from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands.cli import command
 from dpl.evaluation import tables
@@ -15,18 +18,26 @@ from dpl.evaluation import tables
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from dpl.evaluation.newton_starts import Trial
+    from benchmarks.newton_starts import Trial
     from dpl.fem import Solver
     from dpl.inference.hybrid import Predict
     from dpl.scene import Scene
 
 Task = tuple[str, ...]  # set of loads, and options of its solvers
+KEYS = (
+    (bool, "twice"),
+    (Sequence[str] | None, "solvers"),
+    (int, "n_far_loads", 0, 10**6),
+    (int, "max_far_iterations", 1, 10**6),
+    (int | None, "max_plain_iterations", 1, 10**6),
+    (float, "step_tol", 0, math.inf),
+)
 
 
-@command("convergence")
+@command("convergence", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Measure all solvers on all loads; write rows, machine and figure."""
-    from dpl.evaluation import newton_figure, newton_starts
+    from benchmarks import newton_figure, newton_starts
 
     runs = config.load_runs(cfg.run, cfg.networks, trust=cfg.trust)
     scene = next(iter(runs.values()))[1].scene
@@ -50,7 +61,7 @@ def measure(cfg: DictConfig, scene: "Scene", networks: "Mapping[str, Predict]") 
     A task is a set of loads with the options of its solvers. The file keeps the results of tasks
     that are not requested.
     """
-    from dpl.evaluation import newton_starts
+    from benchmarks import newton_starts
 
     sets = newton_starts.load_sets(scene, cfg.count, cfg.n_far_loads, twice=cfg.twice)
     middle = sorted(cfg.tols)[len(cfg.tols) // 2]
@@ -95,7 +106,7 @@ def _solvers(
     budget: int | None,
 ) -> "dict[tuple[str, str], Solver]":
     """Return the solvers that the configuration names, see `newton_starts.solvers_of`."""
-    from dpl.evaluation import newton_starts
+    from benchmarks import newton_starts
 
     try:
         return newton_starts.solvers_of(
@@ -107,7 +118,7 @@ def _solvers(
 
 def _stored_trials(raw: Path, names: list[str]) -> list["Trial"]:
     """Return the measurements in a file if it is newer than its networks and the named ones."""
-    from dpl.evaluation.newton_starts import Trial
+    from benchmarks.newton_starts import Trial
 
     if not raw.is_file():
         return []

@@ -6,8 +6,8 @@ import itertools
 import pytest
 import torch
 
+from benchmarks import pareto
 from dpl import Sample
-from dpl.evaluation import pareto
 from dpl.evaluation.tables import write
 from dpl.fem import solve
 from dpl.inference import Direct, Hybrid

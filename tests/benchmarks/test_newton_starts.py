@@ -11,9 +11,9 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from dpl.commands import convergence
-from dpl.evaluation import newton_figure, newton_starts
-from dpl.evaluation.newton_starts import (
+from benchmarks import newton_figure, newton_starts
+from benchmarks.commands import convergence
+from benchmarks.newton_starts import (
     Trial,
     limited,
     load_sets,
@@ -21,7 +21,7 @@ from dpl.evaluation.newton_starts import (
     solvers_of,
     summary,
 )
-from dpl.evaluation.plain_newton import PlainNewton
+from benchmarks.plain_newton import PlainNewton
 from dpl.evaluation.tables import read, write
 from dpl.fem import Newton, solve
 from dpl.inference import Hybrid

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from dpl.evaluation.plain_newton import PlainNewton
+from benchmarks.plain_newton import PlainNewton
 from dpl.evaluation.timing import time_interleaved
 from dpl.fem import AndersonSolver, Load, Solver
 from dpl.inference import Hybrid
