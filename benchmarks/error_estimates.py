@@ -44,8 +44,7 @@ MODES = 60  # of the correction of `pod`
 SHARES = (0.05, 0.5, 0.95)  # quantiles of the ratio
 SAID = 0.1  # estimated error below which an answer must not be too good [-]
 LEAST = 1 / 3  # ratio of estimated and true error below which it is [-]
-TOL = 1e-10  # relative residual of the solutions [-]
-EXACT = 1e-9  # true error that rounding decides [-]
+EXACT = 1e-7  # true error that the tolerance of the solutions decides [-]
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,7 @@ BODIES: Mapping[str, Callable[[], Scene]] = {
 
 
 def _scene(problem: Problem, *, n_modes: int = 5, deflection: float = 0.4) -> Scene:
-    newton = Newton(problem, tol=TOL)
+    newton = Newton(problem)
     loads = ModalLoads(newton.linear_solver, n_modes=n_modes, deflection=deflection)
     return Scene(problem, loads, newton)
 

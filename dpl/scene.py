@@ -128,7 +128,7 @@ class Scene:
         It is on compact bodies, seldom on thin ones. The mean number of steps of conjugate
         gradients decides.
         """
-        steps = [factor.count_iterations(u) for factor, u in self._typical_states]
+        steps = [self._corotational(load).count_iterations(u) for load, u in self._typical_states]
         return sum(steps) <= MAX_MEAN_STEPS * len(steps)
 
     @cached_property
@@ -137,20 +137,18 @@ class Scene:
 
         The eigenvalues are relative to K(0) in the rotated frames of the nodes.
         """
-        values = (factor.smallest_ritz_value(u) for factor, u in self._typical_states)
+        states = self._typical_states
+        values = (self._corotational(load).smallest_ritz_value(u) for load, u in states)
         return min(values) < SOFTENED
 
     @cached_property
-    def _typical_states(self) -> list[tuple[CorotationalPreconditioner, Tensor]]:
-        """Corotated factor of K(0) and equilibrium (1, N, D) [-] of a few random loads."""
+    def _typical_states(self) -> list[tuple[Load, Tensor]]:
+        """A few random loads and their equilibria (1, N, D) [-]."""
         loads = self.loads.sample((0, CORRECTOR_STREAM), range(3)).unbatch()
-        return [
-            (
-                self.linear.with_parameters(load.parameters).corotational,
-                solve(self.solver, load).displacement,
-            )
-            for load in loads
-        ]
+        return [(load, solve(self.solver, load).displacement) for load in loads]
+
+    def _corotational(self, load: Load) -> CorotationalPreconditioner:
+        return self.linear.with_parameters(load.parameters).corotational
 
     @property
     def length(self) -> float:

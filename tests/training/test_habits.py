@@ -254,7 +254,7 @@ def test_the_printed_command_resumes_the_callbacks_and_the_logger(train, script,
     words = shlex.split(line)[-7:]
     assert words[:2] == ["run=torn", "ckpt_path=last"]
     assert set(words[2:]) == {*EMA, *QUIET, "logger=csv", stop}
-    again = script("train", *(one for one in words if one != stop), cwd=home)
+    again = script("train", *(one for one in words if one != stop), "trust=true", cwd=home)
     assert again.status == 0, again.err
     assert (home / "torn" / "csv" / "metrics.csv").is_file()
     assert checkpoint(home, "torn")["callbacks"]["AveragedWeights"]["steps"] == 6
