@@ -386,7 +386,7 @@ class Surrogate(L.LightningModule):
     def check_predictions(self) -> None:
         """Raise ValueError if a prediction of a load of the scene is not finite."""
         load = self.scene.loads.sample((0, SCALE_STREAM), range(2))
-        with torch.inference_mode():
+        with torch.no_grad():  # tensors that a network keeps are used for derivatives, too
             if not self.predict(load).isfinite().all():
                 raise ValueError("the answers of the network are not finite")
 
