@@ -10,7 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.error_estimates import EXACT, Estimate, Row
+from benchmarks.error_estimates import EXACT, LEAST, SAID, Estimate, Row
 from dpl.visualization import COLOURS, DPI, STYLE
 
 WIDTH = 100  # of the table [characters]
@@ -37,8 +37,24 @@ def show(rows: Sequence[Row]) -> None:
             counts = [f"{count or ''}" for count in (row.missed, row.unknown)]
             table.add_row(row.prediction, f"{row.count}", f"{row.error:.0e}", *ratios, *counts)
     Console(width=WIDTH).print(table)
-    said = sum(row.count for row in rows)
-    print(f"{said} answers, {sum(row.missed for row in rows)} of them missed")
+
+
+def conclude(found: Sequence[Estimate]) -> None:
+    """Print how many answers say too little, and how good small estimates are."""
+    pairs = np.array([(one.estimated, one.error) for one in found])
+    estimated, error = pairs[pairs[:, 1] > EXACT].T
+    said = estimated < SAID
+    ratios = estimated / error
+    small = np.quantile(ratios[estimated < 0.01], (0.01, 0.05, 0.5, 0.95))
+    infinite = np.isinf(pairs[:, 0])
+    large = ratios[(error > 1) & np.isfinite(estimated)]
+    print(
+        f"{len(found)} answers, {infinite.sum()} with an infinite estimate\n"
+        f"{said.sum()} say less than {SAID:.0%}: {(ratios[said] < LEAST).sum()} of them less than "
+        f"a third of the error, at least {ratios[said].min():.2g} times\n"
+        f"stated below 1 %: {', '.join(map(_short, small))} times (1, 5, 50, 95 %)\n"
+        f"errors above 100 %: at least {_short(min(large, default=np.nan))} times"
+    )
 
 
 def _short(ratio: float) -> str:

@@ -123,7 +123,7 @@ class Scene:
 
     @cached_property
     def is_compact(self) -> bool:
-        """Whether the corotated factor of K(0) is near the tangent under a few random loads.
+        """True if the corotated factor of K(0) is near the tangents under a few random loads.
 
         It is on compact bodies, seldom on thin ones. The mean number of steps of conjugate
         gradients decides.
@@ -133,7 +133,7 @@ class Scene:
 
     @cached_property
     def is_softened(self) -> bool:
-        """Whether a random load softens the body: an eigenvalue of the tangent is far below K(0)'s.
+        """True if one of a few random loads lowers an eigenvalue of the tangent below `SOFTENED`.
 
         The eigenvalues are relative to K(0) in the rotated frames of the nodes.
         """

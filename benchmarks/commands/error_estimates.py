@@ -42,6 +42,7 @@ def main(cfg: DictConfig) -> None:
     write_machine(folder / f"{cfg.name}.json")
     error_estimate_figure.draw(found, folder / f"{cfg.name}.png")
     error_estimate_figure.show(rows)
+    error_estimate_figure.conclude(found)
 
 
 def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator["Estimate"]:

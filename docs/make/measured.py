@@ -178,12 +178,6 @@ PARTS = (
         "The test load with the largest displacement.",
     ),
     Part(
-        "against_newton",
-        "Calls to tolerances beside Newton's method",
-        "python scripts/benchmark.py cases=[newton] run=runs folder=benchmarks/results",
-        "Calls of the simulator and Newton's method from rest alternate, on one thread.",
-    ),
-    Part(
         "error_estimates",
         "Estimated over true errors",
         "python scripts/error_estimates.py folder=benchmarks/results",

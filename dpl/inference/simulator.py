@@ -23,7 +23,7 @@ from dpl.fem import (
 )
 from dpl.fem.mesh.regions import Region
 from dpl.fem.solvers import concatenate
-from dpl.fem.solvers.error_estimate import MANY_PRODUCTS, PRODUCTS, nearest
+from dpl.fem.solvers.error_estimate import MANY_PRODUCTS, PRODUCTS
 from dpl.inference.answer import Answer, answer_like, summarise
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.grasp import GraspAnswer, Gripper
@@ -50,7 +50,7 @@ class Simulator:
 
     Called with a force alone, it returns the prediction with its residual and its estimated error.
     If the model comes with Newton's method in its modes, it makes steps of this method while the
-    error in the modes is too large, and a corotational correction and further steps if the
+    error in the modes is too large, and a correction of the whole and further steps if the
     estimated error is too large then. With a tolerance for the residual or the estimated error, it
     tries network, linear solution, hybrid and Newton in this order until the tolerance is met; with
     a budget, while there is time. It keeps the last displacement as an initial guess of the next
@@ -59,7 +59,7 @@ class Simulator:
     Attributes:
         surrogate: The surrogate.
         newton: Newton's method in the modes of the model; None: predictions are not corrected.
-        steps: Largest number of its steps and of corotational corrections together.
+        steps: Largest number of its steps and of corrections of the whole together.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Simulator:
         self._first_pace = 0.0  # time of the start of the hybrid and its first iteration [s]
         self._estimate_time = 0.0  # time of an estimate of the error [s]
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
-        self.scene.is_softened  # noqa: B018
+        self.scene.is_compact, self.scene.is_softened  # noqa: B018
         self.scene.linear.reference.corotational  # noqa: B018  # so is the factor of the estimate
 
     @classmethod
@@ -325,7 +325,7 @@ class Simulator:
             products=request.products,
         )  # fmt: skip
         self._estimate_time = time.perf_counter() - begin
-        if found.is_indefinite and int(state.negative_pivots) < 0:
+        if found.is_indefinite:
             state = state.unstable()
         error = max(candidate.error_in_modes, found.error)
         return candidate._replace(state=state, error=error, correction=found.correction)
@@ -351,13 +351,13 @@ class Simulator:
         clock = time.perf_counter()
         if request.warm and self._before and torch.equal(self._before[0], load.parameters):
             starts.append(_evaluated("last", problem, self._before[1], load, tol))
-        guesses = [one.state.displacement for one in starts if not self._is_far(load, one)]
+        distances = [self._distance(load, one) for one in starts]
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
             linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
             yield _evaluated("linear", problem, linear, load, tol)
-        start = guesses[0] if guesses else None
-        if len(guesses) > 1:
-            start = nearest(self.scene.newton, load, guesses)
+        start = None
+        if (least := min(distances, default=math.inf)) <= FAR:
+            start = starts[distances.index(least)].state.displacement
         for state in self._iterates(load, start, tol):
             if int(state.iterations):
                 now = time.perf_counter()
@@ -376,37 +376,41 @@ class Simulator:
 
     @cached_property
     def _is_poor(self) -> bool:
-        """Whether predictions of a few random loads are far from equilibrium.
+        """True if predictions of a few random loads are far from equilibrium.
 
         Newton's method from rest is faster than it is to try such predictions.
         """
         problem, tol = self.scene.problem, self.scene.solver.tol
         return all(
-            self._is_far(
+            not self._distance(
                 load, _evaluated("network", problem, self.surrogate.predict(load), load, tol)
             )
+            <= FAR
             for load in self.scene.loads.sample((0, POOR_STREAM), range(3)).unbatch()
         )
 
-    def _is_far(self, load: Load, candidate: Candidate) -> bool:
-        """Return True if the estimated error of a prediction exceeds `FAR`."""
-        error = candidate.error
-        if error is None:
-            error = candidate.error_in_modes + candidate.error_outside
-        if error > FAR and candidate.error is None:
-            products = 0 if self.scene.is_compact else MANY_PRODUCTS
-            error = estimate_error(
-                self.scene.linear, load, candidate.state.displacement, candidate.evaluation,
-                products=products,
-            ).error  # fmt: skip
-        return not error <= FAR
+    def _distance(self, load: Load, candidate: Candidate) -> float:
+        """Return the estimated relative error of a start [-].
+
+        A known error of up to `FAR` in and outside of the modes needs no further estimate.
+        """
+        if candidate.error is not None:
+            return candidate.error
+        known = candidate.error_in_modes + candidate.error_outside
+        if known <= FAR:
+            return known
+        products = 0 if self.scene.is_compact else MANY_PRODUCTS
+        return estimate_error(
+            self.scene.linear, load, candidate.state.displacement, candidate.evaluation,
+            products=products,
+        ).error  # fmt: skip
 
     def _predictions(
         self, load: Load, prediction: Tensor, place: RangeCheck, request: Request
     ) -> Iterator[Candidate]:
         """Yield the prediction after steps in the modes, then corrections of it where they help.
 
-        A correction is the corotational one, which reduces the error outside the modes, followed by
+        A correction is that of `estimate_error`, which reduces the error outside the modes, then
         steps in the modes, which reduce the error that it adds there. Corrections follow while the
         estimated error is too large and decreases.
         """

@@ -37,12 +37,12 @@ class RangeCheck(NamedTuple):
 
     @property
     def is_known(self) -> Tensor:
-        """Whether the load family can tell if the load is in range, (B,)."""
+        """True where the load family recognises its loads, (B,)."""
         return ~self.out_of_span.isnan()
 
     @property
     def inside(self) -> Tensor:
-        """Whether the load is known to be in range, (B,)."""
+        """True where the load is known to be in range, (B,)."""
         return self.is_known & ~self.outside
 
     def split(self) -> list[Self]:

@@ -164,7 +164,7 @@ class PatchLoads(SurfaceLoads, SizedLoads):
 
     @cached_property
     def _partly_fixed(self) -> bool:
-        """Whether some but not all components of a node are fixed."""
+        """True if some but not all components of a node are fixed."""
         free = self._loadable[3]
         return bool((free.any(axis=0) & ~free.all(axis=0)).any())
 

@@ -10,7 +10,6 @@ from dpl.fem.linear.interface import Array
 from dpl.fem.linear.krylov import krylov_steps, scaled_norm
 from dpl.fem.problem import Evaluation
 from dpl.fem.solvers.linear import LinearSolver
-from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load
 
 RTOL = 1e-2  # relative residual of iterative solves for an estimate [-]
@@ -115,24 +114,3 @@ def estimate_error(
     if size == 0:
         return ErrorEstimate(math.inf if distance else 0.0, correction)
     return ErrorEstimate(float(unit * distance) / size, correction)
-
-
-def nearest(newton: Newton, load: Load, guesses: list[Tensor]) -> Tensor:
-    """Return the guess (1, N, D) with the smallest estimated distance from equilibrium.
-
-    The distance is that of `estimate_error` without products. It is infinite for a guess that
-    inverts an element or is not finite.
-
-    Args:
-        newton: Newton's method, whose factor of K(0) is used.
-        load: The load, B = 1.
-        guesses: Displacements, (1, N, D) [-] each.
-    """
-    solver = newton.linear_solver
-    found = [estimate_error(solver, load, u, products=0).correction for u in guesses]
-    return guesses[min(range(len(guesses)), key=lambda k: _norm(found[k]))]
-
-
-def _norm(correction: Tensor | None) -> float:
-    """Return the norm of a correction; infinite if there is none."""
-    return math.inf if correction is None else scaled_norm(correction.numpy().ravel())

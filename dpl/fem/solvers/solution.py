@@ -99,9 +99,10 @@ class Solution(NamedTuple):
         return self.status <= Status.UNSTABLE
 
     def unstable(self) -> Self:
-        """Return the solution with a tangent of which negative curvature is known, B = 1."""
-        pivots = torch.where(self.negative_pivots > 0, self.negative_pivots, 1)
-        status = torch.where(self.converged, int(Status.UNSTABLE), self.status)
+        """Return the solution as unstable where negative pivots were not counted."""
+        is_unknown = self.negative_pivots < 0
+        pivots = torch.where(is_unknown, 1, self.negative_pivots)
+        status = torch.where(self.converged & is_unknown, int(Status.UNSTABLE), self.status)
         return self._replace(negative_pivots=pivots, status=status)
 
     @property
