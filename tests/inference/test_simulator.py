@@ -294,9 +294,7 @@ def test_the_last_answer_starts_the_next_where_it_is_nearer(scene, forces, truth
     assert not torch.equal(again.displacement, first.displacement)
 
 
-def test_the_smallest_correction_is_not_that_of_the_smallest_residual(
-    scene, loads
-):
+def test_the_smallest_correction_is_not_that_of_the_smallest_residual(scene, loads):
     load = loads.unbatch()[0]
     exact = solve(scene.solver, load).displacement
     noise = torch.randn(exact.shape, generator=torch.Generator().manual_seed(0)).double()
