@@ -13,8 +13,8 @@ from torch import Tensor
 from benchmarks import paper_tables
 from dpl import Sample, Scene
 from dpl.fem import Load, Material, ModalLoads, Status, solve
-from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.models import Unrolled
+from dpl.models.unrolled.features import SampleCells
 from dpl.system.threads import one_thread
 from dpl.training.metrics import default_metrics
 

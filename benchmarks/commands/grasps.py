@@ -22,7 +22,7 @@ def main(cfg: DictConfig) -> None:
     from dpl import config
     from dpl.evaluation.tables import show, write, write_machine
     from dpl.inference import Gripper
-    from dpl.models.newton_choice import MAX_STEPS
+    from dpl.models.unrolled.correction import MAX_STEPS
     from dpl.system.threads import one_thread
 
     _, surrogate = config.load_run(cfg.run)

@@ -31,7 +31,7 @@ from dpl.inference.hybrid import default_hybrid
 from dpl.inference.request import Candidate, Request
 from dpl.inference.training_range import RangeCheck
 from dpl.models import Correctable, HasCorrection
-from dpl.models.newton_choice import MAX_STEPS
+from dpl.models.unrolled.correction import MAX_STEPS
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import Surrogate

@@ -20,6 +20,6 @@ if TYPE_CHECKING:
         HasCorrection,
         TrainsInCoordinates,
     )
-    from dpl.models.unrolled import Unrolled
+    from dpl.models.unrolled.model import Unrolled
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

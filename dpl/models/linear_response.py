@@ -10,12 +10,6 @@ from torch.nn.functional import pad
 
 from dpl.fem.linear.condensation import Condensed, condense, condensed_block_solve
 from dpl.fem.materials.material import Material
-from dpl.fem.rom.compiled_prediction import (
-    IterationArrays,
-    LawEntries,
-    LawWeights,
-    LinearPrediction,
-)
 from dpl.fem.rom.iterated_inverse import IteratedInverse
 from dpl.fem.rom.stiffness_interpolation import StiffnessInterpolation
 from dpl.fem.rom.stiffness_iteration import (
@@ -28,6 +22,12 @@ from dpl.fem.solvers.parity_factor import OrbitForm
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import Symmetry
 from dpl.models.precision import full_precision
+from dpl.models.unrolled.compiled import (
+    IterationArrays,
+    LawEntries,
+    LawWeights,
+    LinearPrediction,
+)
 from dpl.scene import Scene
 
 MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are float32 [-]

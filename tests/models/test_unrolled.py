@@ -9,15 +9,15 @@ from dpl.data import OfflineData
 from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle, solve
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
-from dpl.fem.rom.sampled_stress import cell_gradients, rotated_strain, rotation, unbalanced_stress
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import cell_images, symmetries
 from dpl.inference import Simulator
 from dpl.models import ClosedFormFit, HasCorrection, Unrolled
 from dpl.models.invariant_basis import scatter_fields
 from dpl.models.irreps import representations_of
-from dpl.models.newton_choice import choose_newton
-from dpl.models.stage_regression import GroupAction, Rows, fit_map, weighted_error
+from dpl.models.unrolled.correction import choose_newton
+from dpl.models.unrolled.features import cell_gradients, rotated_strain, rotation, unbalanced_stress
+from dpl.models.unrolled.regression import GroupAction, Rows, fit_map, weighted_error
 from dpl.scene import Sample, Scene
 from dpl.training import MSE, Surrogate
 from tests.laws import COMPILED, ISOTROPIC, LAWS
@@ -390,7 +390,7 @@ def test_the_held_out_error_is_the_mean_norm_of_the_errors_of_the_map(beam, monk
         seen.append((found.error, weighted_error(error, held_out.weights)))
         return found
 
-    monkeypatch.setattr("dpl.models.unrolled_fit.fit_map", watched)
+    monkeypatch.setattr("dpl.models.unrolled.fit.fit_map", watched)
     net = fitted(beam)
     assert len(net.group) > 1
     assert len(seen) > 1

@@ -13,16 +13,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from dpl.fem.assembly import element_loops, sampled_loops
+from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.lanes import gather_constants, rows
-from dpl.fem.assembly.sampled_loops import rotated_strain, unbalanced_stress
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.linear import condensation
 from dpl.fem.linear.condensation import add_product, condensed_solve, dot
+from dpl.models.unrolled import feature_loops
+from dpl.models.unrolled.feature_loops import rotated_strain, unbalanced_stress
 
 SOURCES = (
     element_loops.SOURCES
-    + sampled_loops.SOURCES
+    + feature_loops.SOURCES
     + "".join(inspect.getsource(m) for m in (condensation, sys.modules[__name__]))
 )
 
@@ -253,7 +254,7 @@ def nonlinear_coordinates(law, c, needs, finite, model, linear):
     """Return coordinates (R,) of the nonlinear displacement.
 
     Args:
-        law, c, needs, finite: The law, see `dpl.fem.rom.compiled_prediction.law_arguments`.
+        law, c, needs, finite: The law, see `dpl.models.unrolled.compiled.law_arguments`.
         model: The arrays of the model.
         linear: Coordinates of the Galerkin linear solution, (R,).
     """
@@ -291,7 +292,7 @@ def predict(law, c, needs, finite, model, reduced, of_law, force, field):
     """Set the field of a prediction.
 
     Args:
-        law, c, needs, finite: The law, see `dpl.fem.rom.compiled_prediction.law_arguments`.
+        law, c, needs, finite: The law, see `dpl.models.unrolled.compiled.law_arguments`.
         model: The arrays of the model.
         reduced: (V^T K(0) V)^-1, (R, R), and V^T K(0) p of the prescribed displacement p, (R,).
         of_law: Weights and moduli of the law, see `set_linear_solution`.

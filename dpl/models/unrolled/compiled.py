@@ -10,11 +10,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dpl.fem.assembly import iterated_prediction_loops
-from dpl.fem.assembly.iterated_prediction_loops import IterationArrays, predict_iterated
 from dpl.fem.assembly.kernels import call_compiled, constants_of
 from dpl.fem.assembly.numba_laws import Law, required_terms
-from dpl.fem.assembly.prediction_loops import (
+from dpl.fem.assembly.simd import SIMD_WIDTH
+from dpl.fem.linear.condensation import Fronts
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.parity import Parities, SignedOrbits
+from dpl.fem.rom.reduced_stiffness import ReducedInverse
+from dpl.fem.symmetry import Symmetry
+from dpl.models.unrolled import iterated_loops
+from dpl.models.unrolled.iterated_loops import IterationArrays, predict_iterated
+from dpl.models.unrolled.loops import (
     SOURCES,
     BasisArrays,
     LinearArrays,
@@ -23,12 +29,6 @@ from dpl.fem.assembly.prediction_loops import (
     OrbitArrays,
     predict,
 )
-from dpl.fem.assembly.simd import SIMD_WIDTH
-from dpl.fem.linear.condensation import Fronts
-from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-from dpl.fem.parity import Parities, SignedOrbits
-from dpl.fem.rom.reduced_stiffness import ReducedInverse
-from dpl.fem.symmetry import Symmetry
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ def law_arguments(law: InvariantBasedMaterial, *, iterated: bool = False) -> Law
         law: The law of the sample cells in the order of the loop.
         iterated: True for the loops of iterated linear solutions.
     """
-    sources = iterated_prediction_loops.SOURCES if iterated else SOURCES
+    sources = iterated_loops.SOURCES if iterated else SOURCES
     rows = [constants_of(law)[0], *(np.reshape(one, (-1, 1)) for one in (law.mu, law.lam))]
     count = max(map(len, rows))
     constants = np.concatenate([np.broadcast_to(row, (count, row.shape[1])) for row in rows], 1)

@@ -1,6 +1,6 @@
 """Compiled loops of one prediction whose linear solution takes several steps.
 
-They differ from `dpl.fem.assembly.prediction_loops` in the linear solution only.
+They differ from `dpl.models.unrolled.loops` in the linear solution only.
 """
 
 import inspect
@@ -11,17 +11,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from dpl.fem.assembly import prediction_loops
-from dpl.fem.assembly.prediction_loops import (
+from dpl.fem.linear.condensation import condensed_iteration
+from dpl.models.unrolled import loops
+from dpl.models.unrolled.loops import (
     add_modes,
     force_by_parity,
     galerkin,
     nonlinear_coordinates,
     set_field,
 )
-from dpl.fem.linear.condensation import condensed_iteration
 
-SOURCES = prediction_loops.SOURCES + inspect.getsource(sys.modules[__name__])
+SOURCES = loops.SOURCES + inspect.getsource(sys.modules[__name__])
 
 
 class IterationArrays(NamedTuple):
@@ -63,7 +63,7 @@ def set_iterated_solution(linear, iteration, moduli, entries, parts, values):
 
 @njit(error_model="numpy", nogil=True, cache=True)
 def predict_iterated(law, c, needs, finite, model, iteration, reduced, of_law, force, field):
-    """Set the field of a prediction, see `dpl.fem.assembly.prediction_loops.predict`.
+    """Set the field of a prediction, see `dpl.models.unrolled.loops.predict`.
 
     Args:
         law, c, needs, finite, model, reduced, force, field: As there.

@@ -9,24 +9,24 @@ from torch import Tensor
 from dpl.fem import InvariantBasedMaterial, Material, SubspaceNewton, symmetries
 from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.parity import Parities
-from dpl.fem.rom.compiled_prediction import (
+from dpl.fem.rom.ecsw import Cubature
+from dpl.fem.rom.reduced_problem import refuse_follower_loads
+from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
+from dpl.fem.symmetry import cell_images
+from dpl.models.invariant_basis import orthonormal_fields
+from dpl.models.linear_base import SCALE_STREAM
+from dpl.models.linear_response import LinearResponse
+from dpl.models.stored_buffers import StoredBuffers, check_indices
+from dpl.models.unrolled.compiled import (
     CompiledPrediction,
     LawArguments,
     LawEntries,
     LawWeights,
     law_arguments,
 )
-from dpl.fem.rom.ecsw import Cubature
-from dpl.fem.rom.reduced_problem import refuse_follower_loads
-from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
-from dpl.fem.rom.sampled_stress import SampleCells
-from dpl.fem.symmetry import cell_images
-from dpl.models.invariant_basis import orthonormal_fields
-from dpl.models.linear_base import SCALE_STREAM
-from dpl.models.linear_response import LinearResponse
-from dpl.models.newton_choice import LOADS, choose_newton, remaining_error
-from dpl.models.stored_buffers import StoredBuffers, check_indices
-from dpl.models.unrolled_fit import Maps, cell_positions, fit_in_best_modes
+from dpl.models.unrolled.correction import LOADS, choose_newton, remaining_error
+from dpl.models.unrolled.features import SampleCells
+from dpl.models.unrolled.fit import Maps, cell_positions, fit_in_best_modes
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.threads import on_threads

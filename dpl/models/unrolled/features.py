@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.fem.assembly.sampled_loops import MIN_VOLUME_RATIO, POLAR_ITER, SERIES_ANGLE
 from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import cofactor, volume_change
 from dpl.fem.problem import Problem
+from dpl.models.unrolled.feature_loops import MIN_VOLUME_RATIO, POLAR_ITER, SERIES_ANGLE
 
 
 class SampleCells(NamedTuple):

@@ -2,7 +2,7 @@
 
 `SIMD_WIDTH` sample cells are processed at once, one per SIMD lane; H and features of a block of
 cells are rows of vectors. Tests compare the loops with the tensor operations of
-`dpl.fem.rom.sampled_stress`.
+`dpl.models.unrolled.features`.
 """
 
 import inspect
@@ -69,8 +69,8 @@ def set_cofactors(X, out):
 def unbalanced_stress(law, c, needs, finite, H, linear, work, out):
     """Set out (18, width) to R^T dP and dP at H (9, width); H is overwritten.
 
-    See `dpl.fem.rom.sampled_stress.unbalanced_stress`. The last two constants c (n + 2, width) are
-    mu and lambda. `work` is (100, width).
+    See `dpl.models.unrolled.features.unbalanced_stress`. The last two constants of c (n + 2, width)
+    are mu and lambda. `work` is (100, width).
     """
     e, X, S, scratch = work[0:6], work[6:12], work[12:18], work[18:44]
     F, minors, D = work[44:53], work[53:62], work[62:98]

@@ -10,7 +10,6 @@ from dpl.fem import Problem
 from dpl.fem.materials.material import Material
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
-from dpl.fem.rom.sampled_stress import SampleCells, cell_gradients
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import Symmetry, cell_images
 from dpl.models.invariant_basis import (
@@ -22,7 +21,8 @@ from dpl.models.invariant_basis import (
 )
 from dpl.models.irreps import representations_of
 from dpl.models.linear_response import LinearResponse
-from dpl.models.stage_regression import GroupAction, Rows, fit_map, weighted_error
+from dpl.models.unrolled.features import SampleCells, cell_gradients
+from dpl.models.unrolled.regression import GroupAction, Rows, fit_map, weighted_error
 from dpl.scene import Sample
 
 CHUNK = 256  # samples whose fields or features are computed at a time

@@ -1,0 +1,1 @@
+"""`unrolled`: an unrolled modified Newton iteration in reduced coordinates with fitted maps."""
