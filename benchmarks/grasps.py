@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -202,10 +202,11 @@ def measure(
         done: Called with the number of grasps that are finished.
     """
     scene = gripper.scene
-    options: dict[str, dict[str, Any]] = {
-        "network": {"steps": 0},
-        "corrected": {},
-        "hybrid to 1e-6": {"tol": TOL},
+    raw = Gripper(gripper.surrogate, steps=0)
+    options = {
+        "network": (raw, None),
+        "corrected": (gripper, None),
+        "hybrid to 1e-6": (gripper, TOL),
     }
     found: dict[str, list[list[float]]] = {name: [] for name in (*options, NEWTON)}
     unit = float(scene.loads.young_range[0]) * scene.force_unit
@@ -213,13 +214,14 @@ def measure(
         patch = gripper.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
         if (known := references(scene, patch, grasp)) is None:
             continue
-        patch.compliance_factor  # noqa: B018  # times are those of a patch that is prepared
+        for one in (gripper, raw):  # times are those of a patch that is prepared
+            one.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double()).compliance_factor  # noqa: B018
         rest, exact = known
         size = grasp.region.radius / scene.length
         own = _errors(patch, size, (rest.displacement, rest.force), exact)
         found[NEWTON].append([*own, 0.0, 1.0, own[0], rest.iterations, rest.milliseconds, 1.0])
-        for name, more in options.items():
-            answer = gripper(grasp.region, grasp.translation, grasp.rotation, **more)
+        for name, (method, tol) in options.items():
+            answer = method(grasp.region, grasp.translation, grasp.rotation, tol=tol)
             u, force = answer.displacement / scene.length, answer.nodal_force / unit
             own = _errors(patch, size, (torch.from_numpy(u), torch.from_numpy(force)), exact)
             quality = [answer.motion_error / scene.length, answer.converged, answer.error]
@@ -285,12 +287,13 @@ def against_amplitude(gripper: Gripper, grasps: Sequence[Grasp]) -> list[Amplitu
         gripper: Gripper of a scene in 3D.
         grasps: The grasps at the amplitude 1.
     """
+    raw = Gripper(gripper.surrogate, steps=0)
     factors = [2.0**-k for k in range(HALVINGS + 1)]
     errors: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
     for grasp in grasps:
         size = 0.0
         for factor in factors:
-            found = _errors_of_prediction(gripper, grasp.scaled(factor))
+            found = _errors_of_prediction(raw, grasp.scaled(factor))
             if found is None:
                 break
             size = size or found[-1]
@@ -299,17 +302,17 @@ def against_amplitude(gripper: Gripper, grasps: Sequence[Grasp]) -> list[Amplitu
     return [Amplitude(factor, *map(median, both)) for factor, both in columns.items()]
 
 
-def _errors_of_prediction(gripper: Gripper, grasp: Grasp) -> tuple[float, float, float] | None:
+def _errors_of_prediction(raw: Gripper, grasp: Grasp) -> tuple[float, float, float] | None:
     """Return the errors of the network and of the linear solution, and the size of the solution.
 
     None without a reference solution.
     """
-    scene = gripper.scene
-    patch = gripper.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
+    scene = raw.scene
+    patch = raw.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
     if (known := references(scene, patch, grasp)) is None:
         return None
     exact = known[-1].displacement
-    answer = gripper(grasp.region, grasp.translation, grasp.rotation, steps=0)
+    answer = raw(grasp.region, grasp.translation, grasp.rotation)
     goal = patch.displacement([x / scene.length for x in grasp.translation], grasp.rotation)
     linear = scene.linear.solve(patch.at(patch.stiffness_times(goal)))
     u = torch.from_numpy(answer.displacement) / scene.length

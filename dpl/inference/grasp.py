@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ from dpl.inference.answer import UNRELIABLE, relative, summarise
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.grasp_forces import Forces, predicted_forces
 from dpl.inference.hybrid import Hybrid
-from dpl.inference.request import Budget, Request
+from dpl.inference.request import Candidate, Request
 from dpl.inference.training_range import RangeCheck
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
@@ -35,7 +35,6 @@ CORRECTED = 3e-4  # change of a displacement below which its correction ends, ov
 MAX_PATCHES = 2  # patches whose compliance and held body are kept
 LARGEST_MOTION = 1e6  # largest translation over L [-] and rotation [rad]
 LEAST_MOTION = 1e-280  # smaller ones count as zero: their residuals cannot be computed
-EXACT = 1e-12  # error of a motion that counts as met exactly [-]
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,8 @@ class GraspAnswer:
         error: Estimated relative error of the displacement [-], see `estimate_error`, plus
             `motion_error` over the largest displacement of the body: no bound.
         force_error, moment_error: Estimated errors of `force` and `moment` over their norms [-],
-            see `wrench_errors`: no bounds. They can be far larger than `error`. Infinite if
-            `error` is; large where symmetry makes a resultant zero.
+            see `HeldBody.wrench_errors`: no bounds. They can be far larger than `error`. They are
+            infinite if `error` is, and large where symmetry makes a resultant zero.
         volume_ratio: min det F [-]; an element is inverted if it is not above 0.
         converged: True if the motion is met exactly, the residual is below the tolerance and no
             element is inverted.
@@ -95,152 +94,109 @@ class GraspAnswer:
     summary: str
 
 
-class Candidate(NamedTuple):
-    """A state of a body with a grasped patch.
+@dataclass(frozen=True, eq=False)
+class HeldBody:
+    """A body whose patch is held at its goal.
 
     Attributes:
-        method: See `GraspAnswer`.
-        state: Displacement with residual and min det F, B = 1.
-        force: Forces of the gripper, (m,) [-]; None: those that balance the stresses.
-    """
-
-    method: str
-    state: Solution
-    force: Tensor | None = None
-
-
-class Held(NamedTuple):
-    """An evaluated candidate.
-
-    Attributes:
-        method, state: See `Candidate`.
-        force: Forces of the gripper at held degrees of freedom, (m,) [-].
-        motion_error: Largest distance of a held node from its prescribed place [-].
-        error: Estimated relative error [-].
-        correction: The correction behind it, (1, N, D) [-]; None if there is none.
-    """
-
-    method: str
-    state: Solution
-    force: Tensor
-    motion_error: float
-    error: float
-    correction: Tensor | None
-
-    @property
-    def is_exact(self) -> bool:
-        """True if the state has converged and meets the motion."""
-        return bool(self.state.converged) and self.motion_error <= EXACT
-
-    @property
-    def rank(self) -> tuple[bool, float]:
-        """Key by which states are sorted; the smallest is best."""
-        return not self.is_exact, self.error
-
-
-def evaluated(
-    patch: RigidPatch, goal: Tensor, load: Load, newton: Newton, candidate: Candidate
-) -> Held:
-    """Return a state with the forces of the gripper and the errors of motion and displacement.
-
-    Args:
         patch: The patch.
         goal: Its displacement, (m,) [-].
         load: Other forces on the body, B = 1, without parameters of the law.
-        newton: Newton's method of the held body.
-        candidate: The state.
+        newton: Newton's method with the patch as a moved support.
     """
-    method, state, force = candidate
-    u = state.displacement
-    evaluation = newton.problem.evaluate(u)
-    missed = patch.at(goal - patch.of_field(u[0])).norm(dim=1).max()
-    largest = u.norm(dim=2).max().clamp(min=1e-300)
-    found = estimate_error(newton.linear_solver, load, u, evaluation)
-    state = state.unstable() if found.is_indefinite else state
-    if force is None:
-        force = patch.of_field(evaluation.internal[0] - load.force[0])
-    error = found.error + float(missed / largest)
-    return Held(method, state, force, float(missed), error, found.correction)
 
+    patch: RigidPatch
+    goal: Tensor
+    load: Load
+    newton: Newton
 
-def wrench_errors(
-    patch: RigidPatch, goal: Tensor, load: Load, newton: Newton, held: Held
-) -> tuple[float, float]:
-    """Return the estimated relative errors of force and moment of the gripper [-].
-
-    The estimates compare them with those of the corrected displacement: the correction behind the
-    estimated error of the displacement is added, and the linear forces that move the patch to its
-    goal. They cost one residual.
-
-    Args:
-        patch, goal, load, newton: See `evaluated`.
-        held: A state.
-    """
-    if held.correction is None:
-        return math.inf, math.inf
-    u = held.state.displacement
-    better = u + held.correction
-    reaction = patch.of_field((newton.problem.evaluate(better).internal - load.force)[0])
-    reaction = reaction + patch.stiffness_times(goal - patch.of_field(u[0]))
-    found, expected = (
-        patch.wrench(patch.at(held.force), u[0]),
-        patch.wrench(patch.at(reaction), better[0]),
-    )
-    sizes = [(float((a - b).norm()), float(a.norm())) for a, b in zip(found, expected, strict=True)]
-    force, moment = (wrong / max(size, 1e-300) if wrong >= 0 else math.inf for wrong, size in sizes)
-    return force, moment
-
-
-def candidates(
-    load: Load, newton: Newton, forces: Forces, steps: int, budget: Budget
-) -> Iterator[Candidate]:
-    """Yield the prediction under the forces of a gripper, corrected if possible, and equilibrium.
-
-    The correction makes iterations with the corotated factor of K(0) of the held body until the
-    displacement changes by less than `CORRECTED`. The equilibrium is that of Newton's method from
-    the corrected prediction, or from rest where that does not lead to a solution.
-
-    Args:
-        load, newton: See `evaluated`.
-        forces: Forces of the gripper by the network.
-        steps: Largest number of iterations of the correction; 0: the prediction is not corrected.
-        budget: Ends correction and Newton's method; their last states are yielded.
-    """
-    field, count = forces.field, forces.predictions
-    guess = torch.where(newton.problem.free, field, newton.problem.prescribed)[None]
-    best = corrected(load, newton, guess, steps, budget) if steps else None
-    if best is None:
-        state = evaluate_solution(newton.problem, field[None], load, newton.tol, from_guess=True)
-        yield Candidate(
-            "network", state._replace(iterations=state.iterations + count), forces.force
+    def with_errors(self, candidate: Candidate) -> Candidate:
+        """Return a candidate with the forces of the gripper, its motion and estimated errors."""
+        patch, u = self.patch, candidate.state.displacement
+        evaluation = self.newton.problem.evaluate(u)
+        missed = float(patch.at(self.goal - patch.of_field(u[0])).norm(dim=1).max())
+        found = estimate_error(self.newton.linear_solver, self.load, u, evaluation)
+        force = candidate.force
+        if force is None:
+            force = patch.of_field(evaluation.internal[0] - self.load.force[0])
+        return candidate._replace(
+            state=candidate.state.unstable() if found.is_indefinite else candidate.state,
+            force=force,
+            motion_error=missed,
+            error=found.error + missed / max(float(u.norm(dim=2).max()), 1e-300),
+            correction=found.correction,
         )
-    else:
-        guess = best.displacement
-        yield Candidate("corrected", best._replace(iterations=best.iterations + count))
-    clock = time.perf_counter()
-    for last in Hybrid(lambda load: guess, newton).iterate(load):
-        now = time.perf_counter()
-        pace, clock = now - clock, now
-        if not last.converged and budget.over(pace):
-            break
-    yield Candidate("hybrid" if bool(last.from_guess) else "full Newton", last)
 
+    def wrench_errors(self, candidate: Candidate) -> tuple[float, float]:
+        """Return the estimated relative errors of force and moment of the gripper [-].
 
-def corrected(
-    load: Load, newton: Newton, guess: Tensor, steps: int, budget: Budget
-) -> Solution | None:
-    """Return the iterate of least residual from a guess (1, N, D); None if that is inverted."""
-    valid: list[Solution] = []
-    for state in AndersonSolver(newton, max_iter=steps).iterate(load, guess=guess):
-        if not bool(state.volume_ratio > 0):
-            break
-        valid.append(state)
-        last = [one.displacement for one in valid[-2:]]
-        if len(valid) > 1 and (last[1] - last[0]).norm() < CORRECTED * last[1].norm():
-            break
-        if len(valid) <= steps and budget.over():
-            break
-    return min(valid, key=lambda one: float(one.residual), default=None)
+        The estimates compare them with those of the corrected displacement: the correction behind
+        the estimated error of the displacement is added, and the linear forces that move the patch
+        to its goal. They cost one residual.
+        """
+        if candidate.correction is None:
+            return math.inf, math.inf
+        patch, u = self.patch, candidate.state.displacement
+        better = u + candidate.correction
+        reaction = self.newton.problem.evaluate(better).internal - self.load.force
+        moved = patch.stiffness_times(self.goal - patch.of_field(u[0]))
+        expected = patch.wrench(patch.at(patch.of_field(reaction[0]) + moved), better[0])
+        assert candidate.force is not None
+        found = patch.wrench(patch.at(candidate.force), u[0])
+        pairs = zip(found, expected, strict=True)
+        sizes = [(float((a - b).norm()), float(a.norm())) for a, b in pairs]
+        force, moment = (e / max(size, 1e-300) if e >= 0 else math.inf for e, size in sizes)
+        return force, moment
+
+    def candidates(self, forces: Forces, steps: int, request: Request) -> Iterator[Candidate]:
+        """Yield the prediction under the forces, corrected if possible, and the equilibrium.
+
+        The equilibrium is that of Newton's method from the corrected prediction, or from rest where
+        that does not lead to a solution.
+
+        Args:
+            forces: Forces of the gripper by the network.
+            steps: Largest number of iterations of the correction; 0: the prediction is not
+                corrected.
+            request: Its budget ends correction and Newton's method; their last states are yielded.
+        """
+        newton, field, count = self.newton, forces.field, forces.predictions
+        guess = torch.where(newton.problem.free, field, newton.problem.prescribed)[None]
+        best = self._corrected(guess, steps, request) if steps else None
+        if best is None:
+            state = evaluate_solution(
+                newton.problem, field[None], self.load, newton.tol, from_guess=True
+            )
+            state = state._replace(iterations=state.iterations + count)
+            yield Candidate("network", state, force=forces.force)
+        else:
+            guess = best.displacement
+            yield Candidate("corrected", best._replace(iterations=best.iterations + count))
+        clock = time.perf_counter()
+        for last in Hybrid(lambda load: guess, newton).iterate(self.load):
+            now = time.perf_counter()
+            pace, clock = now - clock, now
+            if not last.converged and request.over(pace):
+                break
+        yield Candidate("hybrid" if bool(last.from_guess) else "full Newton", last)
+
+    def _corrected(self, guess: Tensor, steps: int, request: Request) -> Solution | None:
+        """Return the iterate of least residual from a guess (1, N, D); None if that is inverted.
+
+        Iterations with the corotated factor of K(0) end when the displacement changes by less than
+        `CORRECTED`.
+        """
+        valid: list[Solution] = []
+        for state in AndersonSolver(self.newton, max_iter=steps).iterate(self.load, guess=guess):
+            if not bool(state.volume_ratio > 0):
+                break
+            valid.append(state)
+            last = [one.displacement for one in valid[-2:]]
+            if len(valid) > 1 and (last[1] - last[0]).norm() < CORRECTED * last[1].norm():
+                break
+            if len(valid) <= steps and request.over():
+                break
+        return min(valid, key=lambda one: float(one.residual), default=None)
 
 
 class Gripper:
@@ -275,38 +231,57 @@ class Gripper:
         budget_ms: float | None = None,
         warm: bool = False,
         sliding: bool = False,
-        steps: int | None = None,
     ) -> GraspAnswer:
-        """Return the displacement of the body with a grasped patch; see `Simulator.grasp`.
+        """Return the displacement of the body while a gripper moves a patch of its boundary.
 
-        `steps` replaces the attribute if it is given.
+        The nodes of the patch move as a rigid body. The forces of the gripper are found through
+        predictions of the network, see `predicted_forces`. With a tolerance, Newton's method solves
+        the equilibrium of the body with the patch as a moved support, from this prediction.
+
+        Args:
+            region: The patch: a region of `dpl.fem` in the coordinates of the mesh, or a mask of
+                nodes (N,). Nodes inside the body and supports are not grasped.
+            translation: Displacement of the mean of the patch, (D,) [m]. None leaves a direction
+                free: the patch slides along it without friction.
+            rotation: Rotation vector about the mean of the patch, (3,), in 2D the angle [rad]; none
+                if left out.
+            force: Further nodal forces, (N, D) [N] (2D: [N/m]); the constant forces of the scene if
+                left out.
+            young: Young's modulus [Pa]; optional if the scene has only one.
+            parameters: A value for each range of the law, by its name or as an array (P,).
+            tol: Relative residual of the result [-]; None: the prediction of the network.
+            budget_ms: Wall time [ms]. No prediction is started after it, and no iteration of Newton
+                that would exceed it. A new patch is prepared and one prediction made in any case.
+            warm: Begin with the forces of the last call if it grasped the same patch.
+            sliding: Hold the largest part of the patch that faces one way along a coordinate axis,
+                along this axis alone, as a flat plate does that is lubricated and does not lift
+                off. Components of the motion across have no effect.
+
+        Raises:
+            ValueError: An argument has a wrong shape or is out of range, the patch has no node that
+                is free to move, or a patch that slides faces no axis.
         """
         begin = time.perf_counter()
-        request = Request.checked(tol, budget_ms, None, warm=warm)._replace(begin=begin)
-        budget = Budget(request)
+        request = replace(Request.checked(tol, budget_ms, None, warm=warm), begin=begin)
         load = self._load(force, young, parameters)
         patch, path = self._patch(region, translation, rotation, load, sliding=sliding)
-        goal = path(1.0)
         with one_thread(), torch.inference_mode():
-            newton = patch.newton(self.scene.corrector, goal)
+            newton = patch.newton(self.scene.corrector, path(1.0))
             newton = newton if request.tol is None else replace(newton, tol=request.tol)
             start = self._last[1] if warm and self._last and self._last[0] is patch else None
             scale = self._motion_without(patch, load)
             predict = partial(self._predict, load)
-            forces = predicted_forces(patch, path, predict, start, scale=scale, is_over=budget.over)
-            self._last = patch, forces.force
-            own = Load(load.force, load.young)  # the body of Newton's method has the parameters
-            count = self.steps if steps is None else steps
-            every = candidates(own, newton, forces, count, budget)
-            held = evaluated(patch, goal, own, newton, next(every))
-            if request.tol is not None and not held.is_exact and not budget.over():
-                solved = evaluated(patch, goal, own, newton, next(every))
-                held = min(held, solved, key=lambda one: one.rank)
-            errors = wrench_errors(patch, goal, own, newton, held)
-            place = RangeCheck.of(
-                self.surrogate, load._replace(force=load.force + patch.at(held.force))
+            forces = predicted_forces(
+                patch, path, predict, start, scale=scale, is_over=request.over
             )
-        return self._reported(patch, load, held, errors, place, forces, budget)
+            self._last = patch, forces.force
+            # the body of Newton's method has the parameters
+            body = HeldBody(patch, path(1.0), Load(load.force, load.young), newton)
+            every = map(body.with_errors, body.candidates(forces, self.steps, request))
+            best = next(every)
+            if request.tol is not None and not best.is_exact and not request.over():
+                best = min(best, next(every), key=lambda one: (not one.is_exact, one.known_error))
+            return self._reported(body, load, best, request, found=forces.found)
 
     def _load(self, force: Any, young: Any, parameters: Any) -> Load:
         """Return the other forces on the body as a load, B = 1."""
@@ -383,28 +358,22 @@ class Gripper:
         return self.surrogate.predict(load._replace(force=load.force + own))[0]
 
     def _reported(
-        self,
-        patch: RigidPatch,
-        load: Load,
-        held: Held,
-        wrench_errors: tuple[float, float],
-        place: RangeCheck,
-        forces: Forces,
-        budget: Budget,
+        self, body: HeldBody, load: Load, held: Candidate, request: Request, *, found: bool
     ) -> GraspAnswer:
-        """Return a state as an answer in SI units."""
+        """Return a candidate as an answer in SI units; `found` is whether its forces are."""
         scene, state = self.scene, held.state
         unit = float(load.young) * scene.force_unit
-        nodal = patch.at(held.force)
-        wrench = patch.wrench(nodal, state.displacement[0])
-        kept = held.is_exact
+        assert held.force is not None
+        nodal, error = body.patch.at(held.force), held.known_error
+        wrench = body.patch.wrench(nodal, state.displacement[0])
+        force_error, moment_error = body.wrench_errors(held)
+        place = RangeCheck.of(self.surrogate, load._replace(force=load.force + nodal))
         amplitude, out_of_span = float(place.amplitude), float(place.out_of_span)
-        outside = bool(place.outside) and not held.error < UNRELIABLE
-        words = summarise(state, kept, held.error, amplitude, out_of_span, outside)
-        force_error, moment_error = wrench_errors
+        outside = bool(place.outside) and not error < UNRELIABLE
+        words = summarise(state, held.is_exact, error, amplitude, out_of_span, outside)
         words += f"; force within about {relative(force_error)}, moment {relative(moment_error)}"
-        if budget.spent:
-            words += f"; stopped by the budget of {budget.request.budget_ms:g} ms"
+        if request.spent:
+            words += f"; stopped by the budget of {request.budget_ms:g} ms"
         missed = held.motion_error * scene.length
         return GraspAnswer(
             displacement=scene.length * state.displacement[0].numpy(),
@@ -413,18 +382,18 @@ class Gripper:
             nodal_force=unit * nodal.numpy(),
             motion_error=missed,
             residual=float(state.residual),
-            error=held.error,
+            error=error,
             force_error=force_error,
             moment_error=moment_error,
             volume_ratio=float(state.volume_ratio),
-            converged=kept,
+            converged=held.is_exact,
             amplitude=amplitude,
             out_of_span=out_of_span,
             out_of_distribution=outside,
             method=held.method,
             iterations=int(state.iterations),
-            milliseconds=1e3 * (time.perf_counter() - budget.request.begin),
-            forces_found=forces.found,
-            stopped=budget.spent,
+            milliseconds=1e3 * (time.perf_counter() - request.begin),
+            forces_found=found,
+            stopped=request.spent,
             summary=f"motion error {missed:.1e} m; {words}",
         )

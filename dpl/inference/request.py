@@ -2,6 +2,7 @@
 
 import math
 import time
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
 from torch import Tensor
@@ -13,9 +14,11 @@ from dpl.fem.solvers.error_estimate import PRODUCTS
 from dpl.inference.arguments import as_number
 from dpl.scene import Scene
 
+EXACT = 1e-12  # error of a motion that counts as met exactly [-]
+
 
 class Candidate(NamedTuple):
-    """A solution with its method.
+    """A solution with its method and its errors.
 
     Attributes:
         method: As of `Answer`.
@@ -26,6 +29,9 @@ class Candidate(NamedTuple):
         error_outside: Its estimated relative error outside of the modes [-]; infinite: unknown.
         correction: The correction behind its estimated error, (1, N, D) [-]; None: not computed.
         evaluation: Internal force and min det F at its displacement, if known.
+        motion_error: Largest distance of a held node from its prescribed place [-].
+        force: Forces of a gripper at held degrees of freedom, (m,) [-]; None: those that balance
+            the stresses.
     """
 
     method: str
@@ -35,6 +41,13 @@ class Candidate(NamedTuple):
     error_outside: float = math.inf
     correction: Tensor | None = None
     evaluation: Evaluation | None = None
+    motion_error: float = 0.0
+    force: Tensor | None = None
+
+    @property
+    def is_exact(self) -> bool:
+        """True if the state has converged and meets the prescribed motion."""
+        return bool(self.state.converged) and self.motion_error <= EXACT
 
     @property
     def known_error(self) -> float:
@@ -42,7 +55,8 @@ class Candidate(NamedTuple):
         return math.inf if self.error is None else self.error
 
 
-class Request(NamedTuple):
+@dataclass
+class Request:
     """Tolerances and budget of a call.
 
     Attributes:
@@ -52,6 +66,7 @@ class Request(NamedTuple):
         warm: Whether the last displacement is a guess too.
         begin: Time at which the computation began [s].
         products: Largest number of products with the tangent in an estimated error.
+        spent: True if a computation ended because of the budget.
     """
 
     tol: float | None
@@ -60,6 +75,7 @@ class Request(NamedTuple):
     warm: bool
     begin: float = 0.0
     products: int = PRODUCTS
+    spent: bool = False
 
     @classmethod
     def checked(cls, tol: Any, budget_ms: Any, error: Any, *, warm: bool) -> Self:
@@ -127,26 +143,10 @@ class Request(NamedTuple):
         valid = bool(state.volume_ratio > 0)
         return not bool(state.converged), not valid, size if size == size else math.inf
 
-    def over(self, ahead: float) -> bool:
-        """Return True if this time from now [s] exceeds the budget."""
-        if self.budget_ms is None:
-            return False
-        return 1e3 * (time.perf_counter() - self.begin + ahead) > self.budget_ms
-
-
-class Budget:
-    """Budget of a call that records whether it has ended a computation.
-
-    Attributes:
-        request: The call.
-        spent: True if a computation ended because of it.
-    """
-
-    def __init__(self, request: Request) -> None:
-        """Store a request, whose time has begun."""
-        self.request, self.spent = request, False
-
     def over(self, ahead: float = 0.0) -> bool:
         """Return True if this time from now [s] exceeds the budget; the caller then ends."""
-        self.spent = self.spent or self.request.over(ahead)
-        return self.spent
+        if self.budget_ms is None:
+            return False
+        is_over = 1e3 * (time.perf_counter() - self.begin + ahead) > self.budget_ms
+        self.spent |= is_over
+        return is_over

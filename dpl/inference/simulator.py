@@ -7,9 +7,8 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any, Self
 
-import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dpl.fem import (
@@ -21,12 +20,11 @@ from dpl.fem import (
     estimate_error,
     evaluate_solution,
 )
-from dpl.fem.mesh.regions import Region
 from dpl.fem.solvers import concatenate
 from dpl.fem.solvers.error_estimate import MANY_PRODUCTS, PRODUCTS
 from dpl.inference.answer import Answer, answer_like, summarise
 from dpl.inference.arguments import as_load, as_numbers
-from dpl.inference.grasp import GraspAnswer, Gripper
+from dpl.inference.grasp import Gripper
 from dpl.inference.hybrid import default_hybrid
 from dpl.inference.request import Candidate, Request
 from dpl.inference.training_range import RangeCheck
@@ -169,7 +167,7 @@ class Simulator:
             members = load.unbatch(), predictions, places.split()
             for single, prediction, place in zip(*members, strict=True):
                 begin = time.perf_counter() - shared
-                own = request._replace(begin=begin, products=self._products(place, request))
+                own = replace(request, begin=begin, products=self._products(place, request))
                 best = self._solve(single, prediction, place, own)
                 if stability:
                     best = best._replace(state=self._with_stability(single, best.state))
@@ -178,57 +176,9 @@ class Simulator:
             answer = self._reported(found, places, request)
         return answer_like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
 
-    def grasp(
-        self,
-        region: Region | NDArray[np.bool_],
-        translation: Sequence[float | None],
-        rotation: ArrayLike | None = None,
-        *,
-        force: ArrayLike | Tensor | None = None,
-        young: float | None = None,
-        parameters: Mapping[str, float] | ArrayLike | None = None,
-        tol: float | None = None,
-        budget_ms: float | None = None,
-        warm: bool = False,
-        sliding: bool = False,
-    ) -> GraspAnswer:
-        """Return the displacement of the body while a gripper moves a patch of its boundary.
-
-        The nodes of the patch move as a rigid body. The forces of the gripper are found through
-        predictions of the network, see `predicted_forces`. With a tolerance, Newton's method solves
-        the equilibrium of the body with the patch as a moved support, from this prediction.
-
-        Args:
-            region: The patch: a region of `dpl.fem` in the coordinates of the mesh, or a mask of
-                nodes (N,). Nodes inside the body and supports are not grasped.
-            translation: Displacement of the mean of the patch, (D,) [m]. None leaves a direction
-                free: the patch slides along it without friction.
-            rotation: Rotation vector about the mean of the patch, (3,), in 2D the angle [rad]; none
-                if left out.
-            force: Further nodal forces, (N, D) [N] (2D: [N/m]); the constant forces of the scene if
-                left out.
-            young: Young's modulus [Pa]; optional if the scene has only one.
-            parameters: A value for each range of the law, by its name or as an array (P,).
-            tol: Relative residual of the result [-]; None: the prediction of the network.
-            budget_ms: Wall time [ms]. No prediction is started after it, and no iteration of Newton
-                that would exceed it. A new patch is prepared and one prediction made in any case.
-            warm: Begin with the forces of the last call if it grasped the same patch.
-            sliding: Hold the largest part of the patch that faces one way along a coordinate axis,
-                along this axis alone, as a flat plate does that is lubricated and does not lift
-                off. Components of the motion across have no effect.
-
-        Raises:
-            ValueError: An argument has a wrong shape or is out of range, the patch has no node that
-                is free to move, or a patch that slides faces no axis.
-        """
-        return self._gripper(
-            region, translation, rotation,
-            force=force, young=young, parameters=parameters, tol=tol, budget_ms=budget_ms,
-            warm=warm, sliding=sliding,
-        )  # fmt: skip
-
     @cached_property
-    def _gripper(self) -> Gripper:
+    def grasp(self) -> Gripper:
+        """The gripper of the body, called as `sim.grasp(region, translation, rotation)`."""
         return Gripper(self.surrogate, steps=self.steps)
 
     def _reported(

@@ -324,7 +324,7 @@ def test_a_budget_ends_newtons_method_and_the_answer_is_the_best_state(scene, mo
             now[0] += 10.0
 
     monkeypatch.setattr(Newton, "iterate", slowly)
-    monkeypatch.setattr("dpl.inference.grasp.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("dpl.inference.request.time.perf_counter", lambda: now[0])
     found = sim.grasp(END, TRANSLATION, ROTATION, tol=1e-14, budget_ms=15e3)
     assert found.stopped
     assert not found.converged
