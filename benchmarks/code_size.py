@@ -1,13 +1,20 @@
-"""Size of a package: modules, lines, lengths of functions and public names per folder.
+"""Size of a package: modules, lines, code lines, lengths of functions, public names by folder.
+
+A code line is no blank line, no comment and no line of a docstring.
 
 python -m benchmarks.code_size          # of dpl
 python -m benchmarks.code_size OTHER    # of another folder, such as an earlier checkout's dpl
 """
 
 import ast
+import io
 import statistics
 import sys
+import tokenize
+from collections import Counter
 from pathlib import Path
+
+IGNORED = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
 
 
 def function_lengths(tree: ast.AST) -> list[int]:
@@ -18,6 +25,19 @@ def function_lengths(tree: ast.AST) -> list[int]:
         for node in ast.walk(tree)
         if isinstance(node, functions)
     ]
+
+
+def code_lines(text: str) -> int:
+    """Return the number of lines of a module that hold code."""
+    found: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in IGNORED:
+            found.update(range(token.start[0], token.end[0] + 1))
+    for node in ast.walk(ast.parse(text)):
+        value = node.value if isinstance(node, ast.Expr) else None
+        if isinstance(value, ast.Constant) and isinstance(value.value, str):
+            found.difference_update(range(value.lineno, (value.end_lineno or 0) + 1))
+    return len(found)
 
 
 def public_names(package: Path) -> int:
@@ -37,15 +57,22 @@ def main(root: Path) -> None:
     lines = {path: len(text.splitlines()) for path, text in modules.items()}
     quantiles = statistics.quantiles(lengths, n=20)
     print(f"modules            {len(modules):8,}")
-    print(f"lines              {sum(lines.values()):8,}")
     print(f"longest module     {max(lines.values()):8,}")
     print(f"functions          {len(lengths):8,}")
     print(f"median function    {statistics.median(lengths):8.0f} lines")
     print(f"95th percentile    {quantiles[-1]:8.0f} lines")
-    print("\npublic names per folder")
-    for package in sorted({path.parent for path in modules if path.name == "__init__.py"}):
-        name = ".".join((root.name, *package.relative_to(root).parts))
-        print(f"  {name:28}{public_names(package):4}")
+    of_folder: Counter[str] = Counter()
+    of_code: Counter[str] = Counter()
+    for path, text in modules.items():
+        for folder in (root, *(root / part for part in path.relative_to(root).parents[:-1])):
+            name = ".".join((root.name, *folder.relative_to(root).parts))
+            of_folder[name] += lines[path]
+            of_code[name] += code_lines(text)
+    print(f"\n{'folder':28}{'lines':>8}{'code':>8}{'public names':>14}")
+    for name in sorted(of_folder):
+        package = root.parent / Path(*name.split("."))
+        names = public_names(package) if (package / "__init__.py").is_file() else 0
+        print(f"{name:28}{of_folder[name]:8,}{of_code[name]:8,}{names:14}")
 
 
 if __name__ == "__main__":

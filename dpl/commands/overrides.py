@@ -89,77 +89,53 @@ def values(one: Override, *, search: bool) -> list[str]:
 
 
 def _reason(name: str, requested: list[Override], error: Exception) -> str:
-    """Return one line that explains why overrides cannot be applied."""
+    """Return one line: the nearest name of an unknown key or option, else the message of Hydra."""
     groups = [one for one in requested if options(name, one.key_or_group)]
+    for one in groups:
+        if not one.is_delete() and (message := _bad_option(one, options(name, one.key_or_group))):
+            return message
     with contextlib.suppress(*REFUSED):
-        chosen = set(hydra.compose(name, return_hydra_config=True).hydra.runtime.choices)
-        for one in groups:
-            if message := _bad_option(one, options(name, one.key_or_group), chosen, str(error)):
-                return message
         ways = [one for one in requested if one.key_or_group == "hydra.searchpath"]
-        lines = [one.input_line for one in (*ways, *groups)]
+        chosen = [one for one in groups if one.key_or_group in hydra.compose(name)]
+        lines = [one.input_line for one in (*ways, *chosen)]
         base = hydra.compose(name, overrides=lines, return_hydra_config=True)
+        known = {*base, *base.hydra.runtime.choices}
         for one in requested:
-            if one not in groups and (message := _bad_key(one, base)):
+            key = one.key_or_group
+            is_new = one.is_add() or one.is_force_add() or "/" in key or key in known
+            if not is_new and (message := _unknown(key, base)):
                 return message
     message = str(error).partition("Config search path")[0]
-    return " ".join(line.strip() for line in message.splitlines() if "://" not in line)
+    return " ".join(line.strip() for line in message.splitlines() if "full_key" not in line)
 
 
-def _bad_option(one: Override, known: list[str], chosen: set[str], error: str) -> str | None:
-    """Return the problem of the choice of an option, None if it is valid.
-
-    `known` are the options of the group, `chosen` the groups of the command. Hydra's message names
-    a missing option.
-    """
+def _bad_option(one: Override, known: list[str]) -> str | None:
+    """Return the problem of the choice of an option, None if it is valid."""
     value, group = one.value(), one.key_or_group
-    adds = one.is_add() or one.is_force_add()
-    if adds and group in chosen:
-        return f"{group}: an option is chosen already; write {one.input_line.lstrip('+')}"
-    if not adds and group not in chosen:
-        return f"{group}: this command has no such key; {validation.suggestion(group, chosen)}"
-    missing = f"{group}/{value}" in error or not isinstance(value, str)
-    if one.is_delete() or isinstance(value, list) or value in known or not missing:
+    if isinstance(value, list) or value in known:
         return None
     near = difflib.get_close_matches(str(value), known, 1)
-    message = [f"{group} = {'null' if value is None else value}: there is no such option"]
-    message += [
-        f"{f'did you mean {near[0]}? ' if near else ''}{group} is one of {', '.join(known)}"
-    ]
-    message += [f"~{group} leaves it out"] if value is None else []
-    message += [f"more come with {install(EXTRAS[group])}"] if group in EXTRAS else []
-    return "; ".join(message)
+    advice = f"did you mean {near[0]}? " if near else ""
+    message = f"{group} = {'null' if value is None else value}: there is no such option; "
+    message += f"{advice}{group} is one of {', '.join(known)}"
+    if value is None:
+        message += f"; ~{group} leaves it out"
+    return f"{message}; more come with {install(EXTRAS[group])}" if group in EXTRAS else message
 
 
-def _bad_key(one: Override, base: DictConfig) -> str | None:
-    """Return the problem of a key that is set, added or removed, None if it is valid."""
-    key, adds = one.key_or_group, one.is_add() or one.is_force_add()
-    if "/" in key:
-        parent = key.rpartition("/")[0]
-        groups = _loader().get_group_options(parent, ObjectType.GROUP)
-        message = validation.suggestion(key, {f"{parent}/{group}" for group in groups})
-        return f"{key}: there is no such group; {message}"
+def _unknown(key: str, base: DictConfig) -> str | None:
+    """Return the advice for a key that does not exist in a configuration, None if it may."""
     node: Any = OmegaConf.to_container(base)
     place = ""
     for part in key.split("."):
         known = _below(node)
-        is_last = key == place + part
-        if part in known and is_last and isinstance(node, list) and one.is_delete():
-            return f"{key} is an entry of a list, which cannot be removed; write the whole list"
-        if part not in known and adds:
-            return None
-        if part not in known and place and not isinstance(node, dict | list):
-            return f"{key}: {place[:-1]} = {node} is no mapping here; set {place[:-1]} as a whole"
         if part not in known:
             more = validation.options_of(node) if isinstance(node, dict) else set()
-            if is_last and part in more and not one.is_delete():
-                return f"{key} is not in this configuration; add it with +{one.input_line}"
             names = {name for name in known if name[0] != "_"} - {"hydra"} | more
+            if part in more or not names:
+                return None
             return f"{key}: there is no such key; {validation.suggestion(part, names, place)}"
         node, place = known[part], f"{place}{part}."
-    if isinstance(node, dict) and "_target_" not in node and isinstance(one.value(), list):
-        entry = f"{key}.{next(iter(node), 'ENTRY')}"
-        return f"{key} is a mapping here and cannot become a list; set its entries, such as {entry}"
     return None
 
 
