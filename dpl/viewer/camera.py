@@ -1,10 +1,14 @@
-"""Perspective camera that fits points into an image."""
+"""Perspective camera, and places of the bodies that stay in view and do not overlap."""
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
-from dpl.viewer.surface import Floats
+from dpl.viewer.frames import Body, Frame, ViewSettings, arrow_ends
+from dpl.viewer.surface import Floats, SupportSymbols
 
 FIELD_OF_VIEW = 0.6  # vertical angle of view [rad]
 VIEW_3D, VIEW_2D = (0.62, -1.0, 0.48), (0.0, -0.02, 1.0)  # directions from a body to the camera
@@ -82,3 +86,92 @@ def _axes(forward: Floats) -> Floats:
     right = np.cross(forward, UP)
     axes = np.stack([right, np.cross(right, forward), forward])
     return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
+
+
+MAX_DEFLECTION = 1.0  # largest displacement over L that the camera takes into account [-]
+GAP = 0.08  # between two bodies over L [-]
+LABEL = 0.03, 0.07  # distance of a label from its body, and its height, over L [-]
+INSETS = (0.03, 0.03, 0.03, 0.03)  # empty margins of the page: left, right, below, above [-]
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Places of the body and a second body.
+
+    Attributes:
+        planar: True for a body in 2D.
+        points: Points of the body at rest and under the largest loads, with arrows and labels,
+            over L, (n, 3).
+        offset: Position of the second body relative to the first over L, (3,).
+    """
+
+    planar: bool
+    points: Floats
+    offset: Floats
+
+    @classmethod
+    def of(cls, body: Body, node: int, radius: float) -> "Layout":
+        """Return the layout for loads on the patch of a node with a radius over L."""
+        surface = body.surface
+        planar, rest = surface.problem.shape[1] == 2, surface.undeformed
+        right, up = image_axes(planar=planar)
+        bare = np.concatenate([rest, SupportSymbols.of(surface).vertices(rest)])
+        shapes = [bare]
+        for frame in largest_loads(body, node, radius):
+            ends = arrow_ends(surface, frame)
+            arrow = np.zeros((0, 3)) if ends is None else ends
+            shapes.append(np.concatenate([bare, frame.points, arrow]))
+        for k, shape in enumerate(shapes):
+            top = label_position(shape, rest, planar=planar) + LABEL[1] * up
+            shapes[k] = np.concatenate([shape, top[None]])
+        points = np.concatenate(shapes)
+        choices = []
+        for axis, along in ((up, np.eye(3)[1 if planar else 2]), (right, right)):
+            extent = max(float(np.ptp(shape @ axis)) for shape in shapes)
+            choices.append((extent + GAP) / float(along @ axis) * along)
+        offset = min(choices, key=lambda shift: _distance(points, shift, planar))
+        return cls(planar, points, offset)
+
+    @property
+    def ground(self) -> float:
+        """Height of the ground over L, below all shapes."""
+        return float(self.points[:, 2].min()) - (0.01 if self.planar else 0.02)
+
+    def camera(
+        self, *, aspect: float = 1.2, both: bool = False, shown: Floats | None = None
+    ) -> Camera:
+        """Return a camera that shows one body or both, and points (n, 3) that are shown."""
+        points = self.points if shown is None else np.concatenate([self.points, shown])
+        if both:
+            points = np.concatenate([points, points + self.offset])
+        return Camera.fit(points, planar=self.planar, aspect=aspect, insets=INSETS)
+
+
+def largest_loads(body: Body, node: int, radius: float) -> Iterator[Frame]:
+    """Yield the frames of the largest loads of the training along all axes and diagonals.
+
+    Frames with displacements above `MAX_DEFLECTION` are left out, since an untrained network can
+    predict any displacement.
+    """
+    patch, dim = body.patch(node, radius), body.scene.problem.shape[1]
+    axes = np.concatenate([np.eye(dim), -np.eye(dim)])
+    diagonals = np.array(list(itertools.product((-1.0, 1.0), repeat=dim)))
+    for direction in torch.from_numpy(np.concatenate([axes, diagonals])):
+        frame = body.solve(body.request(patch.force_along(direction, 1.0)), ViewSettings())
+        size = np.abs(frame.points - body.surface.undeformed).max()
+        if size <= MAX_DEFLECTION:  # False for values that are not finite
+            yield frame
+
+
+def label_position(shown: Floats, rest: Floats, *, planar: bool) -> Floats:
+    """Return a position above all shown points (n, 3), in the middle of the body at rest (S, 3)."""
+    _, up = image_axes(planar=planar)
+    middle = (rest.min(axis=0) + rest.max(axis=0)) / 2
+    return np.asarray(middle + (float((shown @ up).max()) + LABEL[0] - middle @ up) * up)
+
+
+def _distance(points: Floats, offset: Floats, planar: bool) -> float:
+    """Return the distance of the camera that shows two bodies."""
+    both = np.concatenate([points, points + offset])
+    camera = Camera.fit(both, planar=planar, insets=INSETS)
+    return float(np.linalg.norm(camera.position - camera.look_at))

@@ -1,18 +1,29 @@
-"""Controls and readings in the panel of the page."""
+"""Panel of the page: controls, and readings as HTML. All text is escaped."""
 
+import html
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 from viser import ViserServer
 
 from dpl.fem import HasModes
-from dpl.viewer import panel
+from dpl.inference import GraspAnswer
+from dpl.inference.answer import UNRELIABLE, relative
 from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, Frame, ViewSettings
 from dpl.viewer.recording import MAX_FRAMES, SUFFIXES, Recording
-from dpl.viewer.units import round_step, unit_for
+from dpl.viewer.renderer import N_BANDS, band_colours
+from dpl.viewer.units import engineering, round_step, scaled, unit_for, unit_of_scale
 
+GOOD, WARNING, BAD = "#15803d", "#b45309", "#b91c1c"
+ROW = (
+    '<div style="display:flex;justify-content:space-between;gap:12px;line-height:1.65">'
+    '<span style="opacity:.62">{}</span>'
+    '<span style="font-variant-numeric:tabular-nums;text-align:right;{}">{}</span></div>'
+)
+BOX = '<div style="padding:2px 12px 6px;font-size:13.5px">{}</div>'
 LABELS = {"poisson": "Poisson's ratio"}  # of parameters
 NETWORK, BUDGET = "network", "best within the budget"
 PULL, GRASP = "pull", "grasp"
@@ -26,7 +37,7 @@ METHODS = {NETWORK: None, **{f"residual below {tol:.0e}": tol for tol in TOLERAN
 
 
 class Controls:
-    """Widgets of the panel.
+    """Widgets of the
 
     Attributes:
         mode: Mode of a drag, `PULL` or `GRASP`.
@@ -45,13 +56,13 @@ class Controls:
     """
 
     def __init__(self, server: ViserServer, body: Body, title: str, folder: Path) -> None:
-        """Add the widgets to the panel."""
+        """Add the widgets to the"""
         gui, scene = server.gui, body.scene
         self._gui, self._body = gui, body
         nodes, dim = scene.problem.shape
         law = type(scene.problem.material).__name__
         about = f"{title} · {nodes * dim:,} degrees of freedom · {law}"
-        gui.add_html(panel.message(about, "inherit"))
+        gui.add_html(message(about, "inherit"))
         self._result, self._legend = gui.add_html(""), gui.add_html("")
         self._newton = gui.add_html("", visible=False)
         self._error = gui.add_html("")
@@ -61,7 +72,7 @@ class Controls:
             self._add_method_controls()
         with gui.add_folder("Record", expand_by_default=False):
             self.record = gui.add_button("Start recording", color="red")
-            self._state = gui.add_html(panel.message(f"Files are saved in {folder}", "inherit"))
+            self._state = gui.add_html(message(f"Files are saved in {folder}", "inherit"))
             self.save = gui.add_button_group("save as", tuple(SUFFIXES))
         self.follows_frame = False
         of_patch = (self.radius, self.axis, self.angle, self.sliding)
@@ -123,7 +134,7 @@ class Controls:
     def show_mode(self) -> None:
         """Show the controls of the selected mode, with the last radius of this mode."""
         mode = self.mode.value
-        self._about.content = panel.message(ABOUT[mode], "inherit")
+        self._about.content = message(ABOUT[mode], "inherit")
         self._radii[self._shown_mode] = self.radius.value
         self.radius.value, self._shown_mode = self._radii[mode], mode
         for control in (self.direction, self.amplitude, self.unlimited, self.uniform):
@@ -170,23 +181,23 @@ class Controls:
 
         `node` is the node whose displacement is shown.
         """
-        self._result.content = panel.result_table(frame, frame_rate, node)
-        self._legend.content = panel.legend(frame, top)
+        self._result.content = result_table(frame, frame_rate, node)
+        self._legend.content = legend(frame, top)
         if self.follows_frame and frame.answer is not None:
             limit = float(self.amplitude.max)
             self.amplitude.value = round(min(float(frame.answer.amplitude), limit), 2)
 
     def show_newton_frame(self, frame: Frame | None, visible: bool) -> None:
         """Update the table of Newton, or hide it."""
-        self._newton.content, self._newton.visible = panel.newton_table(frame), visible
+        self._newton.content, self._newton.visible = newton_table(frame), visible
 
     def show_error(self, text: str) -> None:
         """Show why a request cannot be solved; an empty text removes the message."""
-        self._error.content = panel.message(text, panel.BAD)
+        self._error.content = message(text, BAD)
 
     def show_progress(self, seconds: float) -> None:
         """Show for how long the solve in progress has taken [s]."""
-        self._error.content = panel.message(f"Solving for {seconds:.0f} s ...")
+        self._error.content = message(f"Solving for {seconds:.0f} s ...")
 
     def show_recording(self, recording: Recording) -> None:
         """Update the label of the record button."""
@@ -196,6 +207,137 @@ class Controls:
         if running:
             self.show_state(f"{count} frames", "inherit")
 
-    def show_state(self, text: str, colour: str = panel.WARNING) -> None:
+    def show_state(self, text: str, colour: str = WARNING) -> None:
         """Show a message below the record button."""
-        self._state.content = panel.message(text, colour)
+        self._state.content = message(text, colour)
+
+
+def result_table(frame: Frame, frame_rate: float, node: int) -> str:
+    """Return forces, method, time, residual, range check and summary of a result of the simulator.
+
+    `node` is the node whose displacement is shown, the centre of the patch.
+    """
+    answer = frame.answer
+    assert answer is not None
+    colour = GOOD if frame.converged else WARNING if frame.volume_ratio > 0 else BAD
+    outside = answer.out_of_distribution
+    place = "outside" if outside else "unknown" if np.isnan(answer.out_of_span) else "inside"
+    is_told = frame.grasp is None or outside  # the forces of a good grasp may have any place
+    span = f"{place}, amplitude {answer.amplitude:.2f}"
+    rows = [
+        *(_load_rows(frame) if frame.grasp is None else _gripper_rows(frame, frame.grasp)),
+        _row("displacement at the hand", _length(frame.displacement[node]), "font-weight:600"),
+        _row("computed by", str(answer.method), "font-weight:600"),
+        _row("time", f"{answer.milliseconds:.1f} ms, {frame_rate:.0f} fps"),
+        _row("estimated error", relative(float(answer.error)), f"color:{colour}"),
+        _row(
+            "residual ‖R‖/‖f‖",
+            f"{frame.residual:.1e}" if frame.residual else "0",
+            f"color:{colour}",
+        ),
+        _row("min det F", f"{frame.volume_ratio:.3f}"),
+        _row("linear solves" if frame.grasp is None else "iterations", f"{answer.iterations}"),
+        *([_row("training range", span, f"color:{BAD if outside else GOOD}")] if is_told else []),
+        f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
+        f'{colour};background:{colour}14;line-height:1.35">{html.escape(answer.summary)}</div>',
+    ]
+    return BOX.format("".join(rows))
+
+
+def _load_rows(frame: Frame) -> list[str]:
+    """Return the total force of a load."""
+    return [_row("total force", _force(frame.load.force.sum(dim=0)), "font-weight:600")]
+
+
+def _gripper_rows(frame: Frame, grasp: GraspAnswer) -> list[str]:
+    """Return force and moment of the gripper, and the distance of the patch from the hand."""
+    moment = float(np.linalg.norm(grasp.moment))
+    unit = "N m" if len(grasp.moment) == 3 else "N"
+    return [
+        _row("force of the gripper", _force(grasp.force), "font-weight:600"),
+        _row("moment of the gripper", engineering(moment, unit), "font-weight:600"),
+        _row("motion error", engineering(grasp.motion_error, "m")),
+    ]
+
+
+def _force(force: ArrayLike) -> str:
+    """Return the size of a force (D,) [N]."""
+    components = np.asarray(force)
+    unit = "N" if len(components) == 3 else "N/m"
+    return engineering(float(np.linalg.norm(components)), unit)
+
+
+def _length(vector: ArrayLike) -> str:
+    """Return the length of a vector [m]."""
+    return engineering(float(np.linalg.norm(np.asarray(vector))), "m")
+
+
+def problem_of(frame: Frame, *, has_budget: bool = False) -> str:
+    """Return why a frame cannot be used, in one line; empty if it can.
+
+    With a budget the user has chosen the time after which a grasp stops, so that this is no reason.
+    """
+    if not frame.volume_ratio > 0:
+        return "Not valid: an element is inverted. Move the hand back."
+    grasp = frame.grasp
+    if grasp is not None and grasp.stopped and not has_budget:
+        return (
+            f"Not solved: stopped after {grasp.milliseconds / 1e3:.1f} s with an estimated error "
+            f"of {relative(grasp.error)}. Move the hand back."
+        )
+    if grasp is None or grasp.error < UNRELIABLE:
+        return ""
+    apart = engineering(grasp.motion_error, "m")
+    return (
+        f"Not reliable: estimated error {relative(grasp.error)}, the patch is {apart} away from "
+        "the hand. Move the hand back, or select a residual as method."
+    )
+
+
+def newton_table(frame: Frame | None) -> str:
+    """Return state, iteration and residual of an iterate of Newton; None before the first."""
+    if frame is None:
+        return BOX.format(_row("Newton from zero", "starts when the load is constant"))
+    colour, state = (GOOD, "converged") if frame.converged else (WARNING, "iterating")
+    rows = [
+        _row("Newton from zero", state, f"color:{colour};font-weight:600"),
+        _row("iteration", str(frame.iteration)),
+        _row("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{colour}"),
+    ]
+    return BOX.format("".join(rows))
+
+
+def legend(frame: Frame, top: float) -> str:
+    """Return the colour bar, which ends at `top`, and the range of the values on the surface.
+
+    The result is empty if the bar would end at 0: all values are zero and the body is neutral.
+    """
+    if top <= 0:
+        return ""
+    quantity, unit = frame.quantity, unit_of_scale(top, QUANTITIES[frame.quantity])
+    finite = frame.values[np.isfinite(frame.values)]
+    low, high = (finite.min(), finite.max()) if len(finite) else (0.0, 0.0)
+    cells = "".join(
+        f'<span style="flex:1;background:rgb({r},{g},{b})"></span>'
+        for r, g, b in band_colours(quantity).tolist()
+    )
+    ticks = "".join(f"<span>{scaled(top * k / 4, unit.factor)}</span>" for k in range(5))
+    span = f"{scaled(low, unit.factor)} to {scaled(high, unit.factor)} {unit.name}"
+    return BOX.format(
+        f'<div style="display:flex;justify-content:space-between;margin-bottom:4px">'
+        f"<b>{html.escape(f'{quantity} [{unit.name}]')}</b>"
+        f'<span style="opacity:.62">{N_BANDS} bands</span></div>'
+        f'<div style="display:flex;height:14px;border-radius:3px;overflow:hidden">{cells}</div>'
+        f'<div style="display:flex;justify-content:space-between;font-size:11.5px;opacity:.75">'
+        f"{ticks}</div>" + _row("on the surface", span)
+    )
+
+
+def message(text: str, colour: str = WARNING) -> str:
+    """Return a line of text."""
+    style = f"padding:2px 12px 6px;font-size:13px;color:{colour};line-height:1.35"
+    return f'<div style="{style}">{html.escape(text)}</div>' if text else ""
+
+
+def _row(name: str, value: str, style: str = "") -> str:
+    return ROW.format(html.escape(name), style, html.escape(value))

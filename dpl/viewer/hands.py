@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from dpl.viewer.controls import Controls
-from dpl.viewer.drag_loads import Patch
 from dpl.viewer.frames import Body, Frame
-from dpl.viewer.requests import GraspRequest, LoadRequest, ViewRequest
+from dpl.viewer.requests import GraspRequest, LoadRequest, Patch, ViewRequest
 
 MakeRequest = Callable[[float, Mapping[str, float]], ViewRequest]  # E [Pa], parameters -> request
 

@@ -11,16 +11,14 @@ import numpy as np
 import torch
 import viser
 
-from dpl.viewer import panel
 from dpl.viewer.access import AccessPolicy, check_server, serve_with
-from dpl.viewer.body_node import BodyNode, LocalServer
-from dpl.viewer.controls import GRASP, PULL, Controls
-from dpl.viewer.environment import add_environment, move_camera
-from dpl.viewer.frames import Body, ColourScale, Frame
+from dpl.viewer.camera import Layout
+from dpl.viewer.controls import BAD, GOOD, GRASP, PULL, Controls, problem_of
+from dpl.viewer.frames import Body, Frame
 from dpl.viewer.hands import GraspingHand, Hand, MakeRequest, PullingHand
-from dpl.viewer.layout import Layout
-from dpl.viewer.load_marker import LoadMarker
+from dpl.viewer.nodes import BodyNode, LoadMarker, LocalServer, add_environment, move_camera
 from dpl.viewer.recording import SUFFIXES, Recording
+from dpl.viewer.renderer import ColourScale
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
@@ -37,7 +35,7 @@ class Page:
         worker: Thread that solves.
         server: viser server.
         layout: Places of the bodies and cameras that show them.
-        controls: Widgets of the panel.
+        controls: Controls of the panel.
         recording: Recording of the shown frames.
         folder: Folder of recordings.
         frame: The most recent frame, if there is one.
@@ -247,9 +245,9 @@ class Page:
                 path = self.recording.save_animation(self.folder, suffix)
                 if event.client is not None:
                     event.client.send_file_download(path.name, path.read_bytes())
-            self.controls.show_state(f"Written: {path}", panel.GOOD)
+            self.controls.show_state(f"Written: {path}", GOOD)
         except (ValueError, OSError) as error:
-            self.controls.show_state(str(error), panel.BAD)
+            self.controls.show_state(str(error), BAD)
 
     # --- requests to the worker and its results
 
@@ -299,5 +297,5 @@ class Page:
         self.controls.show_frame(frame, self._scale.top, self.worker.frame_rate, self.node)
         self.controls.show_newton_frame(self.newton_frame, self.worker.settings.show_newton)
         has_budget = self.worker.settings.budget_ms is not None
-        self.controls.show_error(self._error or panel.problem_of(frame, has_budget=has_budget))
+        self.controls.show_error(self._error or problem_of(frame, has_budget=has_budget))
         self.controls.show_recording(self.recording)

@@ -1,5 +1,6 @@
 """Images of frames without a display: the body from far to near, its load and a legend."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,10 +18,8 @@ from PIL import Image
 
 from dpl.fem.postprocess import triangle_normals
 from dpl.viewer.camera import Camera
-from dpl.viewer.frames import QUANTITIES, Frame
-from dpl.viewer.load_arrow import ARROW_COLOUR, arrow_ends
-from dpl.viewer.supports import SUPPORT_COLOUR, SupportSymbols
-from dpl.viewer.surface import Floats, Surface, contour_bands, vertex_normals
+from dpl.viewer.frames import QUANTITIES, Frame, arrow_ends
+from dpl.viewer.surface import Floats, SupportSymbols, Surface, contour_bands, vertex_normals
 from dpl.viewer.units import scaled, unit_of_scale
 
 COLOUR_MAPS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
@@ -31,6 +30,7 @@ N_BANDS = 12
 NEUTRAL = (188, 194, 204)  # colour of a body at rest
 GRAZING = -0.2  # smallest distance of the camera above a visible face, over L
 BACKGROUND, TEXT, TEXT_GREY, OUTLINE = "#fafafc", "#202430", "#464a58", "#cdd1da"
+ARROW_COLOUR, SUPPORT_COLOUR = (200, 24, 45), (71, 85, 105)
 Bytes = NDArray[np.uint8]
 
 
@@ -47,6 +47,35 @@ def colour_bands(surface: Surface, frame: Frame, top: float) -> list[Floats]:
     """Return the corners of the triangles of each band of colours, see `contour_bands`."""
     levels = np.nan_to_num(frame.values / top * N_BANDS if top > 0 else 0 * frame.values)
     return contour_bands(np.nan_to_num(frame.points), surface.triangles, levels, N_BANDS)
+
+
+class ColourScale:
+    """Colour scale from 0 to a rounded maximum that changes only with large changes of the values.
+
+    Attributes:
+        top: Upper end; 0 before the first values.
+    """
+
+    def __init__(self) -> None:
+        """Start without an upper end."""
+        self.top = 0.0
+
+    def update(self, values: Floats) -> float:
+        """Return the upper end for values; values that are not finite are ignored."""
+        finite = values[np.isfinite(values)]
+        largest = float(finite.max()) if len(finite) else 0.0
+        if largest > self.top or largest < 0.4 * self.top:
+            self.top = round_up(largest)
+        return self.top
+
+
+def round_up(number: float) -> float:
+    """Return the smallest number {1, 1.5, 2, 3, 4, 5, 6, 8} x 10^k that is not smaller."""
+    if not 0 < number < math.inf:
+        return 0.0
+    power = 10.0 ** math.floor(math.log10(number))
+    steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+    return power * next((step for step in steps if number <= step * power * (1 + 1e-9)), 10.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,14 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from dpl.viewer import AccessPolicy
-from dpl.viewer.access import MAX_MESSAGE, check_server, request_status
-from dpl.viewer.rate_limited_log import MAX_CHARACTERS, MIN_INTERVAL, RateLimitedHandler
+from dpl.viewer.access import (
+    MAX_CHARACTERS,
+    MAX_MESSAGE,
+    MIN_INTERVAL,
+    RateLimitedHandler,
+    check_server,
+    request_status,
+)
 
 LONG = 120  # time-out, which no test reaches if the server works [s]
 UPGRADE = {

@@ -6,7 +6,8 @@ import torch
 
 from dpl.fem import NeoHookeanLn, fields, rectangle
 from dpl.viewer import Body
-from dpl.viewer.frames import ERROR, STRESS, ColourScale, ViewSettings, round_up
+from dpl.viewer.frames import ERROR, STRESS, ViewSettings
+from dpl.viewer.renderer import ColourScale, round_up
 from dpl.viewer.surface import Surface, contour_bands
 
 

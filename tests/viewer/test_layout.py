@@ -7,12 +7,9 @@ import pytest
 import torch
 
 from dpl.fem import rectangle
-from dpl.viewer.camera import Camera
-from dpl.viewer.frames import ViewSettings
-from dpl.viewer.layout import Layout, label_position, largest_loads
-from dpl.viewer.load_arrow import arrow_ends, exit_distance
-from dpl.viewer.supports import THICKNESS, SupportSymbols
-from dpl.viewer.surface import Surface
+from dpl.viewer.camera import Camera, Layout, label_position, largest_loads
+from dpl.viewer.frames import ViewSettings, arrow_ends
+from dpl.viewer.surface import THICKNESS, SupportSymbols, Surface, exit_distance
 
 RADIUS = 0.4
 PLATE = rectangle([100.0, 25.0], [9, 4])

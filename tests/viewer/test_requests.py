@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.viewer.frames import ERROR, ViewSettings
+from dpl.viewer.frames import ERROR, ViewSettings, arrow_ends
 from dpl.viewer.hands import GraspingHand
-from dpl.viewer.load_arrow import arrow_ends
 from dpl.viewer.requests import GRASP_LIMIT_MS, distance, interpolate, scale_of
 
 EXACT = ViewSettings(tol=1e-8)

@@ -114,7 +114,7 @@ def test_a_port_in_use_is_reported(script, home):
 
 def test_without_viser_the_message_names_the_extra(script, home, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    for name in ("page", "body_node"):
+    for name in ("page", "nodes"):
         monkeypatch.delitem(sys.modules, f"dpl.viewer.{name}", raising=False)
     monkeypatch.delitem(vars(dpl.viewer), "Page", raising=False)
     ended = script("view", "run=runs/a", cwd=home)

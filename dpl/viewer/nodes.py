@@ -1,4 +1,4 @@
-"""viser scene nodes of one body."""
+"""viser scene nodes: lights and ground, the body with its supports, and its load."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,12 +6,59 @@ from typing import Any
 import numpy as np
 import viser
 
-from dpl.viewer.frames import Frame
-from dpl.viewer.layout import label_position
-from dpl.viewer.load_arrow import arrow_ends
-from dpl.viewer.renderer import N_BANDS, band_colours, colour_bands
-from dpl.viewer.supports import SUPPORT_COLOUR, SupportSymbols
-from dpl.viewer.surface import Floats, Ints, Surface, vertex_normals
+from dpl.viewer.camera import UP, Camera, Layout, label_position
+from dpl.viewer.frames import Frame, arrow_ends
+from dpl.viewer.renderer import ARROW_COLOUR, N_BANDS, SUPPORT_COLOUR, band_colours, colour_bands
+from dpl.viewer.surface import Floats, Ints, SupportSymbols, Surface, vertex_normals
+
+THEME = {"show_logo": False, "show_share_button": False, "control_width": "large"}
+GROUND = {
+    "width": 6.0,
+    "height": 6.0,
+    "cell_size": 0.1,
+    "section_size": 0.5,
+    "cell_color": (226, 228, 233),
+    "section_color": (200, 204, 212),
+    "plane_color": (246, 247, 249),
+    "shadow_opacity": 0.18,
+    "fade_distance": 7.0,
+}
+
+
+def add_environment(server: viser.ViserServer, layout: Layout, surface: Surface) -> None:
+    """Set theme and initial camera, and add lights and ground; a body in 2D lies in the ground."""
+    camera = layout.camera()
+    server.gui.configure_theme(brand_color=(37, 99, 235), **THEME)
+    server.gui.main_panel.dock_right()
+    server.gui.main_panel.set_width(370)
+    server.initial_camera.position = camera.position
+    server.initial_camera.look_at = camera.look_at
+    server.initial_camera.fov = camera.field_of_view
+    scene, points = server.scene, surface.undeformed
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    scene.configure_environment_map(None)
+    scene.configure_default_lights(False)
+    scene.add_light_ambient("/ambient", intensity=1.9)
+    for name, direction, intensity in (
+        ("/sun", np.array([-0.3, 0.25, 1.0]), 0.2 if layout.planar else 1.0),
+        ("/headlight", camera.position - camera.look_at, 1.0),
+    ):
+        position, shadow = middle + 4 * direction / np.linalg.norm(direction), name == "/sun"
+        scene.add_light_directional(
+            name, intensity=intensity, position=position, cast_shadow=shadow
+        )
+    position = (*middle[:2], layout.ground)
+    opacity = 0.0 if layout.planar else 0.6
+    scene.add_grid("/ground", plane_opacity=opacity, position=position, **GROUND)
+
+
+def move_camera(client: viser.ClientHandle, camera: Camera) -> None:
+    """Move the camera of a browser."""
+    with client.atomic():
+        client.camera.up_direction = UP
+        client.camera.position = camera.position
+        client.camera.look_at = camera.look_at
+
 
 DARK, MIDDLE, GREY = (28, 32, 44), (92, 99, 115), (186, 191, 201)
 DRAG_MESH = "/drag"
@@ -137,3 +184,42 @@ class BodyNode:
         planar = self._surface.problem.shape[1] == 2
         position = label_position(np.concatenate(parts), self._surface.undeformed, planar=planar)
         self.label.position = position
+
+
+MAX_DOTS = 120
+DOT_SIZE = 0.005  # diameter of a dot over L [-]
+
+
+class LoadMarker:
+    """Dots on the loaded nodes and an arrow in the direction of the total force.
+
+    Attributes:
+        mask: Loaded nodes of the surface, (S,).
+    """
+
+    def __init__(self, server: LocalServer, surface: Surface) -> None:
+        """Add the nodes to the scene."""
+        self._server, self._surface = server, surface
+        self.mask = np.zeros(len(surface.nodes), dtype=bool)
+        self._dots = server.scene.add_point_cloud(
+            "/patch", np.zeros((1, 3)), ARROW_COLOUR, point_size=DOT_SIZE, point_shape="circle"
+        )
+        sizes = {"shaft_radius": 0.009, "head_radius": 0.024, "head_length": 0.055}
+        self._arrow = server.scene.add_arrows("/arrow", np.zeros((1, 2, 3)), ARROW_COLOUR, **sizes)
+        self._arrow.visible = False
+
+    def show(self, frame: Frame) -> None:
+        """Update the nodes to a frame."""
+        points = np.nan_to_num(frame.points)
+        ends = arrow_ends(self._surface, frame)
+        with self._server.atomic():
+            self._dots.points = self._dot_positions(points).astype(np.float32)
+            self._arrow.visible = ends is not None
+            if ends is not None:
+                self._arrow.points = ends[None].astype(np.float32)
+
+    def _dot_positions(self, points: Floats) -> Floats:
+        """Return positions above the surface, so that the surface does not hide half of a dot."""
+        normals = vertex_normals(points, self._surface.triangles)
+        dots = (points + DOT_SIZE / 2 * normals)[self.mask]
+        return dots[:: len(dots) // MAX_DOTS + 1]
