@@ -8,26 +8,28 @@ import numpy as np
 import torch
 
 from dpl.viewer.frames import Body, Frame, ViewSettings, arrow_ends
-from dpl.viewer.surface import Floats, SupportSymbols
+from dpl.viewer.surface import Floats
 
 FIELD_OF_VIEW = 0.6  # vertical angle of view [rad]
 VIEW_3D, VIEW_2D = (0.62, -1.0, 0.48), (0.0, -0.02, 1.0)  # directions from a body to the camera
 UP = (0.0, 0.0, 1.0)
+MAX_DEFLECTION = 1.0  # largest displacement over L that the camera takes into account [-]
+GAP = 0.08  # between two bodies over L [-]
+LABEL = 0.03, 0.07  # distance of a label from its body, and its height, over L [-]
+MARGINS = (0.03, 0.03, 0.03, 0.03)  # empty margins of an image: left, right, below, above [-]
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Perspective camera.
+    """Perspective camera with the vertical angle of view `FIELD_OF_VIEW`.
 
     Attributes:
         position: Position over L, (3,).
         look_at: Point at the centre of the image over L, (3,).
-        field_of_view: Vertical angle of view [rad].
     """
 
     position: Floats
     look_at: Floats
-    field_of_view: float = FIELD_OF_VIEW
 
     @classmethod
     def fit(
@@ -36,7 +38,7 @@ class Camera:
         *,
         planar: bool = False,
         aspect: float = 1.2,
-        insets: tuple[float, float, float, float] = (0.05, 0.05, 0.05, 0.05),
+        margins: tuple[float, float, float, float] = MARGINS,
     ) -> "Camera":
         """Return the nearest camera whose image contains all points, in the usual direction.
 
@@ -47,14 +49,16 @@ class Camera:
             points: Points over L, (n, 3).
             planar: Look from above, for bodies in 2D.
             aspect: Width over height of the image.
-            insets: Empty margins left, right, below and above, over width or height [-].
+            margins: Empty margins left, right, below and above, over width or height [-].
         """
         axes = _axes(-np.array(VIEW_2D if planar else VIEW_3D))
         x, y, z = axes @ points.T
         half = float(np.tan(FIELD_OF_VIEW / 2))
         left, right, below, above = (
-            size * (1 - 2 * inset)
-            for size, inset in zip((half * aspect, half * aspect, half, half), insets, strict=True)
+            size * (1 - 2 * margin)
+            for size, margin in zip(
+                (half * aspect, half * aspect, half, half), margins, strict=True
+            )
         )
         sides = [
             ((x - right * z).max(), (-x - left * z).max(), right, left),
@@ -71,14 +75,8 @@ class Camera:
         x, y, depth = np.moveaxis(
             (points - self.position) @ _axes(self.look_at - self.position).T, -1, 0
         )
-        scale = height / (2 * np.tan(self.field_of_view / 2))
+        scale = height / (2 * np.tan(FIELD_OF_VIEW / 2))
         return np.stack([width / 2 + scale * x / depth, height / 2 - scale * y / depth, depth], -1)
-
-
-def image_axes(*, planar: bool) -> tuple[Floats, Floats]:
-    """Return the directions to the right and upwards in the image of `Camera.fit`, (3,) each."""
-    right, up, _ = _axes(-np.array(VIEW_2D if planar else VIEW_3D))
-    return right, up
 
 
 def _axes(forward: Floats) -> Floats:
@@ -88,15 +86,14 @@ def _axes(forward: Floats) -> Floats:
     return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
 
 
-MAX_DEFLECTION = 1.0  # largest displacement over L that the camera takes into account [-]
-GAP = 0.08  # between two bodies over L [-]
-LABEL = 0.03, 0.07  # distance of a label from its body, and its height, over L [-]
-INSETS = (0.03, 0.03, 0.03, 0.03)  # empty margins of the page: left, right, below, above [-]
+def image_axes(*, planar: bool) -> Floats:
+    """Return unit vectors to the right and upwards in the image of `Camera.fit`, (2, 3)."""
+    return _axes(-np.array(VIEW_2D if planar else VIEW_3D))[:2]
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
-    """Places of the body and a second body.
+class Placement:
+    """Places of the body and of a second body that is compared with it.
 
     Attributes:
         planar: True for a body in 2D.
@@ -110,17 +107,15 @@ class Layout:
     offset: Floats
 
     @classmethod
-    def of(cls, body: Body, node: int, radius: float) -> "Layout":
-        """Return the layout for loads on the patch of a node with a radius over L."""
+    def of(cls, body: Body, node: int, radius: float) -> "Placement":
+        """Return the places for loads on the patch of a node with a radius over L."""
         surface = body.surface
-        planar, rest = surface.problem.shape[1] == 2, surface.undeformed
+        planar, rest = surface.planar, surface.undeformed
         right, up = image_axes(planar=planar)
-        bare = np.concatenate([rest, SupportSymbols.of(surface).vertices(rest)])
+        bare = np.concatenate([rest, surface.supports.vertices(rest)])
         shapes = [bare]
         for frame in largest_loads(body, node, radius):
-            ends = arrow_ends(surface, frame)
-            arrow = np.zeros((0, 3)) if ends is None else ends
-            shapes.append(np.concatenate([bare, frame.points, arrow]))
+            shapes.append(np.concatenate([bare, frame.points, arrow_ends(surface, frame)]))
         for k, shape in enumerate(shapes):
             top = label_position(shape, rest, planar=planar) + LABEL[1] * up
             shapes[k] = np.concatenate([shape, top[None]])
@@ -129,8 +124,8 @@ class Layout:
         for axis, along in ((up, np.eye(3)[1 if planar else 2]), (right, right)):
             extent = max(float(np.ptp(shape @ axis)) for shape in shapes)
             choices.append((extent + GAP) / float(along @ axis) * along)
-        offset = min(choices, key=lambda shift: _distance(points, shift, planar))
-        return cls(planar, points, offset)
+        places = [cls(planar, points, offset) for offset in choices]
+        return min(places, key=lambda place: _distance(place.camera(both=True)))
 
     @property
     def ground(self) -> float:
@@ -144,7 +139,11 @@ class Layout:
         points = self.points if shown is None else np.concatenate([self.points, shown])
         if both:
             points = np.concatenate([points, points + self.offset])
-        return Camera.fit(points, planar=self.planar, aspect=aspect, insets=INSETS)
+        return Camera.fit(points, planar=self.planar, aspect=aspect)
+
+
+def _distance(camera: Camera) -> float:
+    return float(np.linalg.norm(camera.position - camera.look_at))
 
 
 def largest_loads(body: Body, node: int, radius: float) -> Iterator[Frame]:
@@ -168,10 +167,3 @@ def label_position(shown: Floats, rest: Floats, *, planar: bool) -> Floats:
     _, up = image_axes(planar=planar)
     middle = (rest.min(axis=0) + rest.max(axis=0)) / 2
     return np.asarray(middle + (float((shown @ up).max()) + LABEL[0] - middle @ up) * up)
-
-
-def _distance(points: Floats, offset: Floats, planar: bool) -> float:
-    """Return the distance of the camera that shows two bodies."""
-    both = np.concatenate([points, points + offset])
-    camera = Camera.fit(both, planar=planar, insets=INSETS)
-    return float(np.linalg.norm(camera.position - camera.look_at))

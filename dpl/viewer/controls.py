@@ -1,6 +1,7 @@
 """Panel of the page: controls, and readings as HTML. All text is escaped."""
 
 import html
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,11 @@ from torch import Tensor
 from viser import ViserServer
 
 from dpl.fem import HasModes
-from dpl.inference import GraspAnswer
 from dpl.inference.answer import UNRELIABLE, relative
 from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, Frame, ViewSettings
 from dpl.viewer.recording import MAX_FRAMES, SUFFIXES, Recording
 from dpl.viewer.renderer import N_BANDS, band_colours
-from dpl.viewer.units import engineering, round_step, scaled, unit_for, unit_of_scale
+from dpl.viewer.units import engineering, round_step, scaled, tick_labels, unit_for
 
 GOOD, WARNING, BAD = "#15803d", "#b45309", "#b91c1c"
 ROW = (
@@ -23,6 +23,7 @@ ROW = (
     '<span style="opacity:.62">{}</span>'
     '<span style="font-variant-numeric:tabular-nums;text-align:right;{}">{}</span></div>'
 )
+BOLD = "font-weight:600"
 BOX = '<div style="padding:2px 12px 6px;font-size:13.5px">{}</div>'
 LABELS = {"poisson": "Poisson's ratio"}  # of parameters
 NETWORK, BUDGET = "network", "best within the budget"
@@ -37,7 +38,7 @@ METHODS = {NETWORK: None, **{f"residual below {tol:.0e}": tol for tol in TOLERAN
 
 
 class Controls:
-    """Widgets of the
+    """Widgets of the panel.
 
     Attributes:
         mode: Mode of a drag, `PULL` or `GRASP`.
@@ -56,7 +57,7 @@ class Controls:
     """
 
     def __init__(self, server: ViserServer, body: Body, title: str, folder: Path) -> None:
-        """Add the widgets to the"""
+        """Add the widgets to the panel."""
         gui, scene = server.gui, body.scene
         self._gui, self._body = gui, body
         nodes, dim = scene.problem.shape
@@ -90,24 +91,24 @@ class Controls:
         first = min(max(RADIUS[PULL], low), high)
         self._radii = {PULL: first, GRASP: min(RADIUS[GRASP], high)}
         self.radius = gui.add_slider("radius / L", 0.0, high, 0.01, first)
-        upwards = (0.0, 1.0, 0.0) if body.scene.problem.shape[1] == 2 else (0.0, 0.0, 1.0)
+        upwards = (0.0, 1.0, 0.0) if body.surface.planar else (0.0, 0.0, 1.0)
         self.direction = gui.add_vector3("direction", upwards, step=0.1)
         self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
         self.axis = gui.add_dropdown("rotation axis", tuple(AXES), initial_value="y")
         self.angle = gui.add_slider("rotation [°]", -90.0, 90.0, 1.0, 0.0, marks=(-90, 0, 90))
         hint = "hold the patch along its normal alone, so that it slides in its plane"
         self.sliding = gui.add_checkbox("sliding", False, hint=hint)
-        self._young_unit = unit_for(body.young, "Pa")
-        low, high = (value / self._young_unit.factor for value in body.young_range)
-        label, middle = f"E [{self._young_unit.name}]", body.young / self._young_unit.factor
-        self.young = gui.add_slider(label, low, high, round_step(low, high), middle)
+        unit, self._young_unit = unit_for(body.young, "Pa")
+        low, high = (value / self._young_unit for value in body.young_range)
+        middle = body.young / self._young_unit
+        self.young = gui.add_slider(f"E [{unit}]", low, high, round_step(low, high), middle)
         stresses = {name: f"{name} [Pa]" for name in body.scene.problem.follower_loads.ranges}
         labels = LABELS | stresses
         self.parameters = {
-            name: gui.add_slider(labels.get(name, name), *ends, round_step(*ends), value)
-            for (name, ends), value in zip(
-                loads.parameter_ranges.items(), body.parameters.values(), strict=True
+            name: gui.add_slider(
+                labels.get(name, name), *ends, round_step(*ends), body.parameters[name]
             )
+            for name, ends in loads.parameter_ranges.items()
         }
         hint = "let a drag exceed the largest load of the training"
         self.unlimited = gui.add_checkbox("no limit", False, hint=hint)
@@ -140,26 +141,26 @@ class Controls:
         for control in (self.direction, self.amplitude, self.unlimited, self.uniform):
             control.visible = mode == PULL
         self.angle.visible = self.sliding.visible = mode == GRASP
-        self.axis.visible = mode == GRASP and self._body.scene.problem.shape[1] == 3
+        self.axis.visible = mode == GRASP and not self._body.surface.planar
 
     @property
     def rotation(self) -> Tensor:
         """Rotation vector of the patch, (3,), in 2D the angle, (1,) [rad]."""
         angle = torch.tensor([self.angle.value]).double().deg2rad()
-        if self._body.scene.problem.shape[1] == 2:
+        if self._body.surface.planar:
             return angle
         return angle * torch.eye(3, dtype=torch.float64)[AXES[self.axis.value]]
 
     @property
     def modulus(self) -> float:
         """Young's modulus of the slider [Pa]; an assigned value is limited to its range."""
-        value = self.young.value * self._young_unit.factor
+        value = self.young.value * self._young_unit
         return float(np.clip(value, *self._body.young_range))
 
     @modulus.setter
     def modulus(self, value: float) -> None:
         within = float(np.clip(value, *self._body.young_range))
-        self.young.value = within / self._young_unit.factor
+        self.young.value = within / self._young_unit
 
     def settings(self) -> ViewSettings:
         """Return method and quantity.
@@ -191,13 +192,9 @@ class Controls:
         """Update the table of Newton, or hide it."""
         self._newton.content, self._newton.visible = newton_table(frame), visible
 
-    def show_error(self, text: str) -> None:
-        """Show why a request cannot be solved; an empty text removes the message."""
-        self._error.content = message(text, BAD)
-
-    def show_progress(self, seconds: float) -> None:
-        """Show for how long the solve in progress has taken [s]."""
-        self._error.content = message(f"Solving for {seconds:.0f} s ...")
+    def show_problem(self, text: str, colour: str = BAD) -> None:
+        """Show why a request is not solved; an empty text removes the message."""
+        self._error.content = message(text, colour)
 
     def show_recording(self, recording: Recording) -> None:
         """Update the label of the record button."""
@@ -217,59 +214,49 @@ def result_table(frame: Frame, frame_rate: float, node: int) -> str:
 
     `node` is the node whose displacement is shown, the centre of the patch.
     """
-    answer = frame.answer
+    answer, grasp = frame.answer, frame.grasp
     assert answer is not None
     colour = GOOD if frame.converged else WARNING if frame.volume_ratio > 0 else BAD
+    unit = "N" if frame.displacement.shape[1] == 3 else "N/m"
+    if grasp is None:
+        rows = [("total force", _size(frame.load.force.sum(dim=0), unit), BOLD)]
+    else:
+        rows = [
+            ("force of the gripper", _size(grasp.force, unit), BOLD),
+            ("moment of the gripper", _size(grasp.moment, "N m" if unit == "N" else "N"), BOLD),
+            ("motion error", engineering(grasp.motion_error, "m"), ""),
+        ]
+    residual = f"{frame.residual:.1e}" if frame.residual else "0"
+    rows += [
+        ("displacement at the hand", _size(frame.displacement[node], "m"), BOLD),
+        ("computed by", str(answer.method), BOLD),
+        ("time", f"{answer.milliseconds:.1f} ms, {frame_rate:.0f} fps", ""),
+        ("estimated error", relative(float(answer.error)), f"color:{colour}"),
+        ("residual ‖R‖/‖f‖", residual, f"color:{colour}"),
+        ("min det F", f"{frame.volume_ratio:.3f}", ""),
+        ("linear solves" if grasp is None else "iterations", f"{answer.iterations}", ""),
+    ]
     outside = answer.out_of_distribution
-    place = "outside" if outside else "unknown" if np.isnan(answer.out_of_span) else "inside"
-    is_told = frame.grasp is None or outside  # the forces of a good grasp may have any place
-    span = f"{place}, amplitude {answer.amplitude:.2f}"
-    rows = [
-        *(_load_rows(frame) if frame.grasp is None else _gripper_rows(frame, frame.grasp)),
-        _row("displacement at the hand", _length(frame.displacement[node]), "font-weight:600"),
-        _row("computed by", str(answer.method), "font-weight:600"),
-        _row("time", f"{answer.milliseconds:.1f} ms, {frame_rate:.0f} fps"),
-        _row("estimated error", relative(float(answer.error)), f"color:{colour}"),
-        _row(
-            "residual ‖R‖/‖f‖",
-            f"{frame.residual:.1e}" if frame.residual else "0",
-            f"color:{colour}",
-        ),
-        _row("min det F", f"{frame.volume_ratio:.3f}"),
-        _row("linear solves" if frame.grasp is None else "iterations", f"{answer.iterations}"),
-        *([_row("training range", span, f"color:{BAD if outside else GOOD}")] if is_told else []),
+    if grasp is None or outside:  # the forces of a good grasp may have any place
+        place = "outside" if outside else "unknown" if np.isnan(answer.out_of_span) else "inside"
+        span = f"{place}, amplitude {answer.amplitude:.2f}"
+        rows.append(("training range", span, f"color:{BAD if outside else GOOD}"))
+    summary = (
         f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
-        f'{colour};background:{colour}14;line-height:1.35">{html.escape(answer.summary)}</div>',
-    ]
-    return BOX.format("".join(rows))
+        f'{colour};background:{colour}14;line-height:1.35">{html.escape(answer.summary)}</div>'
+    )
+    return BOX.format(_rows(rows) + summary)
 
 
-def _load_rows(frame: Frame) -> list[str]:
-    """Return the total force of a load."""
-    return [_row("total force", _force(frame.load.force.sum(dim=0)), "font-weight:600")]
+def _size(vector: ArrayLike, unit: str) -> str:
+    return engineering(float(np.linalg.norm(np.asarray(vector))), unit)
 
 
-def _gripper_rows(frame: Frame, grasp: GraspAnswer) -> list[str]:
-    """Return force and moment of the gripper, and the distance of the patch from the hand."""
-    moment = float(np.linalg.norm(grasp.moment))
-    unit = "N m" if len(grasp.moment) == 3 else "N"
-    return [
-        _row("force of the gripper", _force(grasp.force), "font-weight:600"),
-        _row("moment of the gripper", engineering(moment, unit), "font-weight:600"),
-        _row("motion error", engineering(grasp.motion_error, "m")),
-    ]
-
-
-def _force(force: ArrayLike) -> str:
-    """Return the size of a force (D,) [N]."""
-    components = np.asarray(force)
-    unit = "N" if len(components) == 3 else "N/m"
-    return engineering(float(np.linalg.norm(components)), unit)
-
-
-def _length(vector: ArrayLike) -> str:
-    """Return the length of a vector [m]."""
-    return engineering(float(np.linalg.norm(np.asarray(vector))), "m")
+def _rows(rows: Iterable[tuple[str, str, str]]) -> str:
+    """Return rows of a table: name, value and style of the value."""
+    return "".join(
+        ROW.format(html.escape(name), style, html.escape(value)) for name, value, style in rows
+    )
 
 
 def problem_of(frame: Frame, *, has_budget: bool = False) -> str:
@@ -297,14 +284,14 @@ def problem_of(frame: Frame, *, has_budget: bool = False) -> str:
 def newton_table(frame: Frame | None) -> str:
     """Return state, iteration and residual of an iterate of Newton; None before the first."""
     if frame is None:
-        return BOX.format(_row("Newton from zero", "starts when the load is constant"))
+        return BOX.format(_rows([("Newton from zero", "starts when the load is constant", "")]))
     colour, state = (GOOD, "converged") if frame.converged else (WARNING, "iterating")
     rows = [
-        _row("Newton from zero", state, f"color:{colour};font-weight:600"),
-        _row("iteration", str(frame.iteration)),
-        _row("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{colour}"),
+        ("Newton from zero", state, f"color:{colour};{BOLD}"),
+        ("iteration", str(frame.iteration), ""),
+        ("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{colour}"),
     ]
-    return BOX.format("".join(rows))
+    return BOX.format(_rows(rows))
 
 
 def legend(frame: Frame, top: float) -> str:
@@ -314,22 +301,23 @@ def legend(frame: Frame, top: float) -> str:
     """
     if top <= 0:
         return ""
-    quantity, unit = frame.quantity, unit_of_scale(top, QUANTITIES[frame.quantity])
+    quantity = frame.quantity
+    unit, size, labels = tick_labels(top, QUANTITIES[quantity])
     finite = frame.values[np.isfinite(frame.values)]
     low, high = (finite.min(), finite.max()) if len(finite) else (0.0, 0.0)
     cells = "".join(
         f'<span style="flex:1;background:rgb({r},{g},{b})"></span>'
         for r, g, b in band_colours(quantity).tolist()
     )
-    ticks = "".join(f"<span>{scaled(top * k / 4, unit.factor)}</span>" for k in range(5))
-    span = f"{scaled(low, unit.factor)} to {scaled(high, unit.factor)} {unit.name}"
+    ticks = "".join(f"<span>{label}</span>" for label in labels)
+    span = f"{scaled(low, size)} to {scaled(high, size)} {unit}"
     return BOX.format(
         f'<div style="display:flex;justify-content:space-between;margin-bottom:4px">'
-        f"<b>{html.escape(f'{quantity} [{unit.name}]')}</b>"
+        f"<b>{html.escape(f'{quantity} [{unit}]')}</b>"
         f'<span style="opacity:.62">{N_BANDS} bands</span></div>'
         f'<div style="display:flex;height:14px;border-radius:3px;overflow:hidden">{cells}</div>'
         f'<div style="display:flex;justify-content:space-between;font-size:11.5px;opacity:.75">'
-        f"{ticks}</div>" + _row("on the surface", span)
+        f"{ticks}</div>" + _rows([("on the surface", span, "")])
     )
 
 
@@ -337,7 +325,3 @@ def message(text: str, colour: str = WARNING) -> str:
     """Return a line of text."""
     style = f"padding:2px 12px 6px;font-size:13px;color:{colour};line-height:1.35"
     return f'<div style="{style}">{html.escape(text)}</div>' if text else ""
-
-
-def _row(name: str, value: str, style: str = "") -> str:
-    return ROW.format(html.escape(name), style, html.escape(value))

@@ -45,11 +45,6 @@ class ViewSettings:
     show_newton: bool = False
 
     def __post_init__(self) -> None:
-        """Check quantity and tolerance; the simulator checks the budget.
-
-        Raises:
-            ValueError: The quantity is unknown, or the tolerance is out of range.
-        """
         if self.quantity not in QUANTITIES:
             raise ValueError(f"quantity = {self.quantity!r} must be {' or '.join(QUANTITIES)}")
         if self.tol is not None:
@@ -137,29 +132,49 @@ class Body:
             return low, high
         return low / YOUNG_FACTOR, high * YOUNG_FACTOR
 
-    def request(
-        self,
-        force: Tensor,
-        young: float | None = None,
-        parameters: Mapping[str, float] | None = None,
-    ) -> LoadRequest:
+    def request(self, force: Tensor) -> LoadRequest:
         """Return the request of a dimensionless force (N, D) plus the constant force of the scene.
 
-        The force [N] does not depend on `young`, so that a softer body has larger displacements.
-
-        Raises:
-            ValueError: A value is out of its range.
+        The force [N] is that at the default modulus, so that a softer body has larger
+        displacements.
         """
         constant = self.scene.loads.constant_force
         total = force if constant is None else force + constant
         newtons = total * (self.young * self.scene.force_unit)
-        return LoadRequest(newtons, *self._checked_moduli(young, parameters))
+        return LoadRequest(newtons, self.young, self.parameters)
 
-    def _checked_moduli(
-        self, young: float | None, parameters: Mapping[str, float] | None
-    ) -> tuple[float, dict[str, float]]:
-        """Return Young's modulus [Pa] and the parameters of the law; defaults replace None."""
-        young = self.young if young is None else young
+    def zero_load(self) -> LoadRequest:
+        """Return the request without a force of the user."""
+        return self.request(torch.zeros(self.scene.problem.shape, dtype=torch.float64))
+
+    def grasp(
+        self, nodes: Tensor, translation: Tensor, rotation: Tensor, *, sliding: bool = False
+    ) -> GraspRequest:
+        """Return the request of a grasp, with the constant force of the scene.
+
+        Args:
+            nodes: Mask of the nodes of the patch, (N,).
+            translation, rotation: See `GraspRequest`.
+            sliding: See `GraspRequest`.
+
+        Raises:
+            ValueError: The patch is empty.
+        """
+        if not nodes.any():
+            lacks = "facet across x, y or z" if sliding else "free node"
+            raise ValueError(
+                f"the patch has no {lacks} of the boundary; click another place or enlarge radius"
+            )
+        return GraspRequest(nodes, translation, rotation, self.zero_load(), sliding)
+
+    def with_moduli(
+        self, request: ViewRequest, young: float, parameters: Mapping[str, float] | None = None
+    ) -> ViewRequest:
+        """Return a request with Young's modulus [Pa] and values of the ranges of the law, by name.
+
+        Raises:
+            ValueError: A value is out of its range.
+        """
         low, high = self.young_range
         if not low * (1 - 1e-9) <= young <= high * (1 + 1e-9):
             raise ValueError(f"young = {young:g} must lie between {low:g} and {high:g} Pa")
@@ -167,44 +182,7 @@ class Body:
         for name, (low, high) in self.scene.loads.parameter_ranges.items():
             if not low <= parameters[name] <= high:
                 raise ValueError(f"{name} = {parameters[name]:g} must lie between {low} and {high}")
-        return young, parameters
-
-    def zero_load(
-        self, young: float | None = None, parameters: Mapping[str, float] | None = None
-    ) -> LoadRequest:
-        """Return the request without a force of the user."""
-        force = torch.zeros(self.scene.problem.shape, dtype=torch.float64)
-        return self.request(force, young, parameters)
-
-    def grasp(
-        self,
-        nodes: Tensor,
-        translation: Tensor,
-        rotation: Tensor,
-        young: float | None = None,
-        parameters: Mapping[str, float] | None = None,
-        *,
-        sliding: bool = False,
-    ) -> GraspRequest:
-        """Return the request of a grasp, with the constant force of the scene.
-
-        Args:
-            nodes: Mask of the nodes of the patch, (N,).
-            translation, rotation: See `GraspRequest`.
-            young: Young's modulus [Pa].
-            parameters: Value of each range of the law, by name.
-            sliding: See `GraspRequest`.
-
-        Raises:
-            ValueError: A value is out of its range, or the patch is empty.
-        """
-        if not nodes.any():
-            lacks = "facet across x, y or z" if sliding else "free node"
-            raise ValueError(
-                f"the patch has no {lacks} of the boundary; click another place or enlarge radius"
-            )
-        others = self.zero_load(young, parameters)
-        return GraspRequest(nodes, translation, rotation, others, sliding)
+        return request.with_moduli(young, parameters)
 
     def sample(self, index: int) -> LoadRequest:
         """Return a random load of the training distribution."""
@@ -277,8 +255,8 @@ class Body:
         )
 
 
-def arrow_ends(surface: Surface, frame: Frame) -> Floats | None:
-    """Return start and end of the arrow over L, (2, 3); None if the total force is zero.
+def arrow_ends(surface: Surface, frame: Frame) -> Floats:
+    """Return start and end of the arrow over L, (2, 3); (0, 3) if the total force is zero.
 
     The axis of the arrow passes through the centre of the nodal forces. The arrow starts where its
     axis leaves the body, so that the body does not hide it; in 2D it starts at the centre.
@@ -287,7 +265,7 @@ def arrow_ends(surface: Surface, frame: Frame) -> Floats | None:
     total = np.pad(force.sum(axis=0), (0, 3 - force.shape[1]))
     sizes = np.linalg.norm(force, axis=1)
     if not np.linalg.norm(total) > BALANCED * sizes.sum():
-        return None
+        return np.zeros((0, 3))
     direction = total / np.linalg.norm(total)
     points = np.nan_to_num(frame.points)
     weights = sizes[surface.nodes] if sizes[surface.nodes].any() else np.ones(len(points))

@@ -1,6 +1,6 @@
 """Patches of the body, and requests of the page: a load, or the grasp of a patch."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -132,9 +132,13 @@ class LoadRequest(NamedTuple):
         """Return True if the page interpolates from another request to this one."""
         return isinstance(other, LoadRequest)
 
-    def at(self, coordinates: Tensor, young: float) -> "LoadRequest":
-        """Return the load with other forces and another modulus [Pa]."""
-        return self._replace(force=coordinates.view_as(self.force), young=young)
+    def at(self, coordinates: Tensor) -> "LoadRequest":
+        """Return the load with other forces."""
+        return self._replace(force=coordinates.view_as(self.force))
+
+    def with_moduli(self, young: float, parameters: Mapping[str, float]) -> "LoadRequest":
+        """Return the load on a body with another modulus [Pa] and other parameters of the law."""
+        return self._replace(young=young, parameters=parameters)
 
     def dimensionless(self, scene: Scene) -> Load:
         """Return the load of the mechanics, with B = 1."""
@@ -211,11 +215,14 @@ class GraspRequest(NamedTuple):
             return False
         return torch.equal(self.nodes, other.nodes)
 
-    def at(self, coordinates: Tensor, young: float) -> "GraspRequest":
-        """Return the grasp with another motion and another modulus [Pa]."""
+    def at(self, coordinates: Tensor) -> "GraspRequest":
+        """Return the grasp with another motion."""
         translation, rotation = coordinates.split([len(self.translation), len(self.rotation)])
-        others = self.others._replace(young=young)
-        return self._replace(translation=translation, rotation=rotation, others=others)
+        return self._replace(translation=translation, rotation=rotation)
+
+    def with_moduli(self, young: float, parameters: Mapping[str, float]) -> "GraspRequest":
+        """Return the grasp of a body with another modulus [Pa] and other parameters of the law."""
+        return self._replace(others=self.others.with_moduli(young, parameters))
 
     def answer(
         self,
@@ -270,14 +277,15 @@ class GraspRequest(NamedTuple):
 
 
 ViewRequest = LoadRequest | GraspRequest
+MakeRequest = Callable[[], ViewRequest]  # called in the thread of the worker
 
 
 def interpolate(start: ViewRequest, end: ViewRequest, share: float) -> ViewRequest:
     """Return the request at a share of the way from `start` (0) to `end` (1)."""
     if share >= 1:
         return end
-    coordinates = torch.lerp(start.coordinates, end.coordinates, share)
-    return end.at(coordinates, start.young + share * (end.young - start.young))
+    between = end.at(torch.lerp(start.coordinates, end.coordinates, share))
+    return between.with_moduli(start.young + share * (end.young - start.young), end.parameters)
 
 
 def scale_of(start: ViewRequest, goal: ViewRequest) -> float:

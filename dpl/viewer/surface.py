@@ -55,6 +55,16 @@ class Surface:
         return _to_3d(self.problem.points.numpy())[self.nodes]
 
     @cached_property
+    def supports(self) -> "SupportSymbols":
+        """Symbols of the supports."""
+        return SupportSymbols.of(self)
+
+    @cached_property
+    def planar(self) -> bool:
+        """True for a body in 2D."""
+        return self.problem.shape[1] == 2
+
+    @cached_property
     def _patches(self) -> tuple[Problem, Recovery]:
         """The cells that determine the stresses at the surface, and their recovery."""
         body = self.problem
@@ -183,9 +193,10 @@ def _to_3d(vectors: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class SupportSymbols:
-    """Mesh of the symbols; its vertices follow nodes of the surface.
+    """Mesh of the symbols of supports, whose vertices follow nodes of the surface.
 
-    A node is fixed if at least one component of its displacement is prescribed.
+    A slab lies behind fixed facets, a pyramid at each other fixed node. A node is fixed if at least
+    one component of its displacement is prescribed.
 
     Attributes:
         nodes: Node of the surface that each vertex follows, (V,).
@@ -206,7 +217,7 @@ class SupportSymbols:
         fixed = ~problem.free[torch.from_numpy(surface.nodes)]
         is_fixed = fixed.any(dim=1).numpy()
         moves = bool((fixed.any(dim=1) & ~fixed.all(dim=1)).any() or problem.prescribed.any())
-        slabs = _strips(surface, is_fixed) if problem.shape[1] == 2 else _slabs(surface, is_fixed)
+        slabs = _strips(surface, is_fixed) if surface.planar else _slabs(surface, is_fixed)
         single = is_fixed.copy()
         single[slabs[0]] = False
         pyramids = _pyramids(surface, np.flatnonzero(single))
@@ -223,27 +234,27 @@ def _slabs(surface: Surface, is_fixed: NDArray[np.bool_]) -> tuple[Ints, Floats,
     """Return nodes, offsets and triangles of slabs on the triangles whose corners are fixed."""
     triangles = surface.triangles[is_fixed[surface.triangles].all(axis=1)]
     normals = vertex_normals(surface.undeformed, triangles)
-    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    _, index, count = np.unique(
-        np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return _extrude(triangles, sides[count[index.ravel()] == 1], THICKNESS * normals)
+    return _extrude(triangles, _rim(triangles), THICKNESS * normals)
 
 
 def _strips(surface: Surface, is_fixed: NDArray[np.bool_]) -> tuple[Ints, Floats, Ints]:
     """Return nodes, offsets and triangles of strips along the fixed boundary of a body in 2D."""
-    sides = surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    sides = _rim(surface.triangles)
+    sides = sides[is_fixed[sides].all(axis=1)]
+    first, last = surface.undeformed[sides.T]
+    total = np.zeros_like(surface.undeformed)
+    for k in (0, 1):
+        np.add.at(total, sides[:, k], np.cross(last - first, (0.0, 0.0, 1.0)))
+    return _extrude(np.zeros((0, 3), dtype=int), sides, THICKNESS * _normalise(total))
+
+
+def _rim(triangles: Ints) -> Ints:
+    """Return the sides (K, 2) that belong to one triangle only, in its orientation."""
+    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     _, index, count = np.unique(
         np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
     )
-    sides = sides[(count[index.ravel()] == 1) & is_fixed[sides].all(axis=1)]
-    first, last = (surface.undeformed[sides[:, k]] for k in (0, 1))
-    outwards = np.cross(last - first, (0.0, 0.0, 1.0))
-    total = np.zeros_like(surface.undeformed)
-    for k in (0, 1):
-        np.add.at(total, sides[:, k], outwards)
-    size = np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
-    return _extrude(np.zeros((0, 3), dtype=int), sides, THICKNESS * total / size)
+    return np.asarray(sides[count[index.ravel()] == 1])
 
 
 def _extrude(triangles: Ints, sides: Ints, offsets: Floats) -> tuple[Ints, Floats, Ints]:
@@ -263,13 +274,12 @@ def _pyramids(surface: Surface, single: Ints) -> tuple[Ints, Floats, Ints]:
     """Return nodes, offsets and triangles of pyramids with their tips at single fixed nodes."""
     height, half = PYRAMID
     axis = np.zeros((len(single), 3))
-    if surface.problem.shape[1] == 2:
+    if surface.planar:
         axis[:, 1] = -1.0
     else:
         axis[:] = vertex_normals(surface.undeformed, surface.triangles)[single]
     other = np.eye(3)[np.abs(axis).argmin(axis=1)]
-    first = np.cross(axis, other)
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
+    first = _normalise(np.cross(axis, other))
     second = np.cross(axis, first)
     base = [
         height * axis + half * (i * first + j * second)

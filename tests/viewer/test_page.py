@@ -356,7 +356,7 @@ def test_the_camera_of_a_browser_is_fitted_to_its_window(page):
     for both in (False, True):
         page.controls.show_newton.value = both
         page._fit_client(client)
-        expected = page.layout.camera(aspect=0.6, both=both)
+        expected = page.placement.camera(aspect=0.6, both=both)
         assert client.camera.position == pytest.approx(expected.position)
         assert client.camera.look_at == pytest.approx(expected.look_at)
 
