@@ -27,6 +27,23 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+RequestHandler = Callable[[Any, Request], Response | None]
+MAX_MESSAGE = 2**18  # largest message from the browser [bytes]
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    # All scripts are in the page; those that Emscripten generated need 'unsafe-eval'. Other hosts
+    # are not reachable.
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; "
+        "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; "
+        "connect-src 'self' {sockets} data: blob:; worker-src blob: data:; "
+        "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    ),
+}
 MIN_INTERVAL = 1.0  # shortest time between two lines [s]
 MAX_CHARACTERS = 200  # longest message
 
@@ -87,25 +104,6 @@ class RateLimitedHandler(logging.Handler):
             yield
         except Exception as error:  # no request of a browser may stop the server
             self.report("control", error)
-
-
-RequestHandler = Callable[[Any, Request], Response | None]
-MAX_MESSAGE = 2**18  # largest message from the browser [bytes]
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
-HEADERS = {
-    "Cache-Control": "no-store",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    # All scripts are in the page; those that Emscripten generated need 'unsafe-eval'. Other hosts
-    # are not reachable.
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; "
-        "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; "
-        "connect-src 'self' {sockets} data: blob:; worker-src blob: data:; "
-        "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
-    ),
-}
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Recordings of frames: series for ParaView and animations."""
+"""Recordings of frames: series for ParaView and animations, and one of a rotating load."""
 
 import math
 import threading
@@ -30,6 +30,8 @@ from dpl.viewer.renderer import (
 MAX_FRAMES = 900  # frames of a recording, 30 s at 30 frames per second
 FRAME_RATE = 20  # frames per second of an animation
 FORMATS = (".gif", ".mp4")
+DURATION = 5  # of the animation of a rotating load [s]
+RADIUS, DEFLECTION = 0.45, 0.33  # of its patch, and linear displacement of its centre, over L [-]
 SUFFIXES = {"VTU": ".pvd", "GIF": ".gif", "MP4": ".mp4"}
 
 
@@ -128,8 +130,7 @@ def resample(frames: list[tuple[float, Frame]]) -> list[Frame]:
 def default_captions(frame: Frame) -> list[str]:
     """Return the lines of text for a frame of a recording."""
     answer = frame.answer
-    if answer is None:
-        return [f"Newton, iteration {frame.iteration}", f"relative residual {frame.residual:.1e}"]
+    assert answer is not None
     return [
         f"{answer.method} · {answer.milliseconds:.1f} ms",
         f"relative residual {frame.residual:.1e}",
@@ -206,11 +207,6 @@ def _palette(quantities: set[str]) -> Image.Image:
     return image
 
 
-DURATION = 5  # [s]
-RADIUS = 0.45  # of the patch over L [-]
-DEFLECTION = 0.33  # linear displacement of the centre of the patch over L [-]
-
-
 def animate_load(body: Body, path: Path, *, size: tuple[int, int] = (720, 405)) -> None:
     """Write a looping animation of the network's predictions for a load that rotates once.
 
@@ -257,9 +253,7 @@ def circular_load(body: Body) -> list[Frame]:
 
 def _farthest_node(body: Body) -> int:
     """Return the surface node in the middle of those that are farthest from the fixed nodes."""
-    problem, nodes = body.scene.problem, body.surface.nodes
+    problem, points = body.scene.problem, body.scene.problem.points[body.surface.nodes]
     fixed = problem.points[~problem.free.any(dim=1)]
-    points = problem.points[nodes]
     distance = torch.cdist(points, fixed).amin(dim=1) if len(fixed) else points[:, 0]
-    middle = points[distance > 0.99 * distance.max()].mean(dim=0)
-    return int(nodes[int((points - middle).norm(dim=1).argmin())])
+    return body.surface.middle_node((distance > 0.99 * distance.max()).numpy())

@@ -12,6 +12,7 @@ from dpl.fem import HasModes, Load, RigidPatch, Solution
 from dpl.inference import Answer, GraspAnswer, Simulator
 from dpl.scene import Scene
 
+GRASP_LIMIT_MS = 5000.0  # wall time of a grasp with any other method than a budget [ms]
 RIDGE = 1e-2  # Tikhonov parameter over the squared compliance; limits the use of stiff modes
 
 
@@ -105,9 +106,6 @@ class Patch:
             return torch.zeros_like(self.unit_loads[0])
         far = direction / size * (1e6 * float(self.compliance.norm()) + 1e-300)
         return amplitude * self.force_towards(far)
-
-
-GRASP_LIMIT_MS = 5000.0  # wall time of a grasp with any other method than a budget [ms]
 
 
 class LoadRequest(NamedTuple):

@@ -20,9 +20,12 @@ def tip(body):
 
 
 @pytest.fixture(scope="module", params=["3D", "2D"])
-def any_body(request, body, make_scene, make_body):
-    """The tiny beam and a plate."""
-    return body if request.param == "3D" else make_body(make_scene(mesh=PLATE))
+def placed(request, body, make_scene, make_body):
+    """The tiny beam or a plate, its places, and its shapes at rest and under the largest loads."""
+    body = body if request.param == "3D" else make_body(make_scene(mesh=PLATE))
+    frames = largest_loads(body, tip(body), RADIUS)
+    shapes = [body.surface.undeformed, *(frame.points for frame in frames)]
+    return body, Placement.of(body, tip(body), RADIUS), shapes
 
 
 def box_in_image(camera, points, aspect):
@@ -46,49 +49,43 @@ def test_a_fitted_camera_shows_all_points_and_is_as_near_as_possible(aspect, pla
     assert np.abs(pairs).max(axis=1).min() < 1e-3, "one direction has no further space"
 
 
-@pytest.mark.parametrize("aspect", [0.7, 1.2, 2.0])
 @pytest.mark.parametrize("both", [False, True])
-def test_the_camera_shows_rest_and_largest_loads_of_one_or_two_bodies(any_body, aspect, both):
-    placement = Placement.of(any_body, tip(any_body), RADIUS)
-    camera = placement.camera(aspect=aspect, both=both)
-    shapes = [any_body.surface.undeformed]
-    shapes += [frame.points for frame in largest_loads(any_body, tip(any_body), RADIUS)]
-    dim = any_body.scene.problem.shape[1]
+def test_the_camera_shows_rest_and_largest_loads_of_one_or_two_bodies(placed, both):
+    body, placement, shapes = placed
+    dim = body.scene.problem.shape[1]
     assert len(shapes) == 1 + 2 * dim + 2**dim
     assert max(np.abs(shape - shapes[0]).max() for shape in shapes) > 0.1, "loads are large"
-    for shape in shapes:
+    points = np.concatenate(shapes)
+    for aspect in (0.7, 1.2, 2.0):
+        camera = placement.camera(aspect=aspect, both=both)
         for offset in [np.zeros(3), placement.offset] if both else [np.zeros(3)]:
-            low, high = box_in_image(camera, shape + offset, aspect)
+            low, high = box_in_image(camera, points + offset, aspect)
             assert low.min() > 0
             assert high.max() < 1
 
 
-def test_two_bodies_do_not_overlap_in_the_image(any_body):
-    placement = Placement.of(any_body, tip(any_body), RADIUS)
+def test_two_bodies_do_not_overlap_in_the_image(placed):
+    _, placement, shapes = placed
     camera = placement.camera(both=True)
-    for frame in largest_loads(any_body, tip(any_body), RADIUS):
-        first = box_in_image(camera, frame.points, 1.2)
-        second = box_in_image(camera, frame.points + placement.offset, 1.2)
+    for shape in shapes:
+        first = box_in_image(camera, shape, 1.2)
+        second = box_in_image(camera, shape + placement.offset, 1.2)
         gaps = np.maximum(second[0] - first[1], first[0] - second[1])
         assert gaps.max() > 0
 
 
-def test_the_camera_also_shows_what_lies_beyond_the_largest_loads(any_body):
-    placement = Placement.of(any_body, tip(any_body), RADIUS)
-    far = any_body.surface.undeformed + np.array([1.5, 0.0, 0.0])
+def test_the_camera_also_shows_what_lies_beyond_the_largest_loads(placed):
+    _, placement, shapes = placed
+    far = shapes[0] + np.array([1.5, 0.0, 0.0])
     low, high = box_in_image(placement.camera(shown=far), far, 1.2)
     assert low.min() > 0
     assert high.max() < 1
 
 
-def test_predictions_that_are_not_finite_do_not_move_the_camera(any_body):
-    surrogate = any_body.simulator.surrogate
-    good = surrogate.predict
-    try:
-        surrogate.predict = lambda load: torch.full_like(load.force, torch.nan)
-        placement = Placement.of(any_body, tip(any_body), RADIUS)
-    finally:
-        surrogate.predict = good
+def test_predictions_that_are_not_finite_do_not_move_the_camera(body, monkeypatch):
+    wrong = body.simulator.surrogate
+    monkeypatch.setattr(wrong, "predict", lambda load: torch.full_like(load.force, torch.nan))
+    placement = Placement.of(body, tip(body), RADIUS)
     assert np.isfinite(placement.points).all()
     assert np.isfinite(placement.camera().position).all()
 

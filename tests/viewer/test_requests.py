@@ -1,5 +1,6 @@
 """Requests of loads and grasps: interpolation, answers and the load on the body."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -51,6 +52,9 @@ def test_a_request_continues_only_another_one_of_the_same_patch_and_kind(body, g
     assert not grasp.continues(body.sample(1))
     assert not body.sample(1).continues(grasp)
     assert body.sample(1).continues(body.zero_load())
+    sliding = grasp._replace(sliding=True)
+    assert sliding.continues(sliding.at(sliding.coordinates))
+    assert not sliding.continues(grasp)
 
 
 def test_the_distance_of_grasps_is_relative_to_the_larger_motion(body, grasp):
@@ -135,24 +139,32 @@ def test_the_arrow_of_a_grasp_has_the_direction_of_the_grippers_force(body, gras
     assert not len(arrow_ends(body.surface, rest))
 
 
-def test_a_patch_without_free_nodes_is_refused(body):
-    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmin()])
-    with pytest.raises(ValueError, match="the patch has no free node of the boundary"):
-        body.grasp(body.patch(node, 0.01).held_nodes, UP, TURN)
+def fixed_patch(body):
+    return body.patch(int(body.surface.nodes[body.surface.undeformed[:, 0].argmin()]), 0.01)
 
 
-def test_values_out_of_range_are_refused(body, grasp):
-    with pytest.raises(ValueError, match="young = 1 must lie between"):
-        body.with_moduli(grasp, 1.0)
-    with pytest.raises(ValueError, match="all finite"):
-        body.solve(body.grasp(grasp.nodes, float("nan") * UP, TURN), ViewSettings())
-
-
-def test_a_sliding_grasp_continues_only_another_one(body, grasp):
-    sliding = grasp._replace(sliding=True)
-    assert sliding.continues(sliding)
-    assert not sliding.continues(grasp)
-    assert sliding.at(sliding.coordinates).sliding
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda body: body.grasp(fixed_patch(body).held_nodes, UP, TURN), "no free node of the"),
+        (
+            lambda body: body.grasp(tip_patch(body, 0.01).sliding_nodes, UP, TURN, sliding=True),
+            "the patch has no facet across x, y or z",
+        ),
+        (
+            lambda body: body.solve(
+                body.grasp(tip_patch(body).held_nodes, math.nan * UP, TURN), ViewSettings()
+            ),
+            "all finite",
+        ),
+        (lambda body: body.with_moduli(body.zero_load(), 1.0), "young = 1 must lie between"),
+        (lambda body: ViewSettings(quantity="heat"), "quantity = 'heat'"),
+        (lambda body: ViewSettings(tol=math.nan), "tol = nan"),
+    ],
+)
+def test_invalid_values_are_refused(body, make, words):
+    with pytest.raises(ValueError, match=words):
+        make(body)
 
 
 def test_a_sliding_patch_moves_along_its_normal_alone(body):
@@ -166,12 +178,6 @@ def test_a_sliding_patch_moves_along_its_normal_alone(body):
     assert not frame.hand_force[:, 1:].any()
     *_, last = body.newton_frames(frame.request, EXACT, frame)
     assert torch.allclose(last.displacement, frame.displacement, atol=1e-6 * 8.0)
-
-
-def test_a_patch_without_a_facet_across_an_axis_cannot_slide(body):
-    nodes = body.patch(tip_patch(body).node, 0.01).sliding_nodes
-    with pytest.raises(ValueError, match="the patch has no facet across x, y or z"):
-        body.grasp(nodes, UP, TURN, sliding=True)
 
 
 def test_a_grasp_without_a_budget_has_the_limit_of_the_page(body, grasp):
