@@ -14,10 +14,10 @@ from websockets.typing import Origin, Subprotocol
 
 from dpl.evaluation import timing
 from dpl.fem import Load
-from dpl.viewer.animation import circular_load
-from dpl.viewer.body_node import DRAG_MESH
 from dpl.viewer.frames import QUANTITIES, ViewSettings
+from dpl.viewer.nodes import DRAG_MESH
 from dpl.viewer.page import Page
+from dpl.viewer.recording import circular_load
 from dpl.viewer.renderer import colour_bands
 from dpl.viewer.requests import LoadRequest
 

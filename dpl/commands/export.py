@@ -46,8 +46,7 @@ def main(cfg: DictConfig) -> None:
 
 def export_model(cfg: DictConfig, surrogate: "dpl.Surrogate", folder: Path) -> None:
     """Write the graph and its folder, compare the graph with torch, and measure latencies."""
-    from dpl.export.metadata import describe
-    from dpl.export.reference import solve_reference
+    from dpl.export.metadata import describe, solve_reference
 
     path = folder / "model.onnx"
     start = time.perf_counter()
@@ -55,8 +54,8 @@ def export_model(cfg: DictConfig, surrogate: "dpl.Surrogate", folder: Path) -> N
         graph = export.ExportGraph(surrogate)
         export.export_onnx(graph, path)
     seconds = time.perf_counter() - start
-    reference = solve_reference(graph)
-    meta = describe(graph, path, reference, tol=cfg.tol, errors=_test_errors(Path(cfg.run)))
+    reference, entry = solve_reference(graph)
+    meta = describe(graph, path, entry, tol=cfg.tol, errors=_test_errors(Path(cfg.run)))
     export.write_folder(folder, surrogate, reference, meta)
     export.verify_folder(folder, surrogate, reference, meta)
     report = _report(cfg, graph, export.OnnxSession(path), path) | {

@@ -88,8 +88,7 @@ def bind(cfg: DictConfig) -> "viewer.AccessPolicy":
 
 def write_animation(body: "viewer.Body", path: Path) -> None:
     """Write an animation of a rotating load."""
-    from dpl.viewer.animation import animate_load
-    from dpl.viewer.recording import FORMATS
+    from dpl.viewer.recording import FORMATS, animate_load
 
     if path.suffix not in FORMATS:
         raise config.ConfigError(f"animation = {path} must end with {' or '.join(FORMATS)}")

@@ -20,7 +20,6 @@ import torch
 
 from dpl.export.metadata import FORMAT
 from dpl.export.onnx_graph import Array
-from dpl.export.reference import Reference
 from dpl.fem import HasModes
 from dpl.system.files import atomic_write
 from dpl.training import Surrogate, checkpoints
@@ -29,12 +28,15 @@ RAW = np.dtype("<f8")
 
 
 def write_folder(
-    folder: Path, surrogate: Surrogate, reference: Reference, meta: Mapping[str, Any]
+    folder: Path, surrogate: Surrogate, reference: Mapping[str, Array], meta: Mapping[str, Any]
 ) -> None:
-    """Write all files except the graph and the report; `meta` are the contents of meta.json."""
+    """Write all files except the graph and the report.
+
+    `reference` are the arrays of `solve_reference`, `meta` the contents of meta.json.
+    """
     scene, loads = surrogate.scene, surrogate.scene.loads
     (folder / "reference").mkdir(parents=True, exist_ok=True)
-    for name, field in reference.fields.items():
+    for name, field in reference.items():
         write_raw(folder / "reference" / f"{name}.f64", field)
     if isinstance(loads, HasModes):
         write_raw(folder / "modes.f64", loads.modal_forces.numpy())
@@ -86,7 +88,7 @@ def read_reference(folder: Path) -> dict[str, Array]:
 
 
 def verify_folder(
-    folder: Path, surrogate: Surrogate, reference: Reference, meta: Mapping[str, Any]
+    folder: Path, surrogate: Surrogate, reference: Mapping[str, Array], meta: Mapping[str, Any]
 ) -> None:
     """Read all files back and compare them bit for bit with the data.
 
@@ -96,7 +98,7 @@ def verify_folder(
     weights = checkpoints.read(folder / "weights.safetensors")["state_dict"]
     same = {"meta.json": read_metadata(folder) == json.loads(json.dumps(meta))}
     for name, field in read_reference(folder).items():
-        same[f"reference/{name}.f64"] = np.array_equal(field, reference.fields[name])
+        same[f"reference/{name}.f64"] = np.array_equal(field, reference[name])
     for name, tensor in surrogate.state_dict().items():
         same[f"weights.safetensors: {name}"] = torch.equal(weights[name], tensor)
     if changed := [name for name, is_same in same.items() if not is_same]:

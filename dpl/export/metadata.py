@@ -1,14 +1,15 @@
-"""Contents of `meta.json`: everything that a program needs to use an exported surrogate."""
+"""Contents of `meta.json` and a reference load: what a program needs to use a surrogate."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from dpl.export.onnx_graph import ExportGraph, onnx_opset
-from dpl.export.reference import Reference
-from dpl.fem import HasModes, Problem, moduli_of, surface
+from dpl.export.comparison import CHECK_STREAM
+from dpl.export.onnx_graph import Array, ExportGraph, onnx_opset
+from dpl.fem import HasModes, Problem, evaluate_solution, moduli_of, solve, surface
 from dpl.fem.mesh.writing import flat_cells
 from dpl.fem.postprocess import triangles
 from dpl.models import ClosedFormFit
@@ -37,15 +38,16 @@ SCALING_OF_FIT = "input = force / (young force_unit); model; displacement = leng
 def describe(
     graph: ExportGraph,
     path: Path,
-    reference: Reference,
+    reference: Mapping[str, Any],
     *,
     tol: float,
     errors: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """Return the contents of meta.json.
 
-    `tol` is the largest relative difference of ONNX and torch [-]; `errors` are those of the test
-    set, see `dpl.training.metrics`, if the run was evaluated.
+    `reference` is the entry of the reference load, see `solve_reference`. `tol` is the largest
+    relative difference of ONNX and torch [-]. `errors` are those of the test set, see
+    `dpl.training.metrics`, if the run was evaluated.
     """
     module, scene = graph.surrogate, graph.surrogate.scene
     loads, problem = scene.loads, scene.problem
@@ -68,7 +70,7 @@ def describe(
         "material": {**_law(scene), "young": loads.young_range, **law_ranges},
         "range": _range(scene),
         "errors": errors,
-        "reference": reference.describe(),
+        "reference": reference,
         "mesh": _mesh(problem),
     }
 
@@ -151,4 +153,39 @@ def _mesh(problem: Problem) -> dict[str, Any]:
         "cell_order": "VTK",
         "cells": cells.tolist(),
         "triangles": triangles(surface(problem.mesh)).tolist(),
+    }
+
+
+def solve_reference(
+    graph: ExportGraph, *, max_loads: int = 16
+) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Return the first random load for which Newton converges, and its entry in meta.json.
+
+    Of `max_loads` loads the last one is taken in any case.
+
+    Returns:
+        Arrays by file name: the inputs of the graph with B = 1, `displacement` of the surrogate
+        and `fe_displacement`, (1, N, D) [m]. The entry has the shapes of the arrays, the relative
+        residuals of both displacements, `fe_converged`, and their relative difference `error` [-].
+    """
+    scene = graph.surrogate.scene
+    for k in range(max_loads):
+        load = scene.loads.sample(CHECK_STREAM, [k])
+        inputs = scene.si_inputs(load)
+        with torch.inference_mode():
+            metres = graph(**inputs)
+        fe = solve(scene.solver, load)
+        if bool(fe.converged):
+            break
+    found = evaluate_solution(scene.problem, metres.clone() / scene.length, load, scene.solver.tol)
+    difference = (found.displacement - fe.displacement).norm() / fe.displacement.norm()
+    displacements = {"displacement": metres, "fe_displacement": scene.length * fe.displacement}
+    fields = {name: field.numpy() for name, field in (inputs | displacements).items()}
+    return fields, {
+        "folder": "reference",
+        "shapes": {name: list(field.shape) for name, field in fields.items()},
+        "residual": float(found.residual),
+        "fe_residual": float(fe.residual),
+        "fe_converged": bool(fe.converged),
+        "error": float(difference),
     }

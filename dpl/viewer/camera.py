@@ -1,29 +1,35 @@
-"""Perspective camera that fits points into an image."""
+"""Perspective camera, and places of the bodies that stay in view and do not overlap."""
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from dpl.viewer.frames import Body, Frame, ViewSettings, arrow_ends
 from dpl.viewer.surface import Floats
 
 FIELD_OF_VIEW = 0.6  # vertical angle of view [rad]
 VIEW_3D, VIEW_2D = (0.62, -1.0, 0.48), (0.0, -0.02, 1.0)  # directions from a body to the camera
 UP = (0.0, 0.0, 1.0)
+MAX_DEFLECTION = 1.0  # largest displacement over L that the camera takes into account [-]
+GAP = 0.08  # between two bodies over L [-]
+LABEL = 0.03, 0.07  # distance of a label from its body, and its height, over L [-]
+MARGINS = (0.03, 0.03, 0.03, 0.03)  # empty margins of an image: left, right, below, above [-]
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Perspective camera.
+    """Perspective camera with the vertical angle of view `FIELD_OF_VIEW`.
 
     Attributes:
         position: Position over L, (3,).
         look_at: Point at the centre of the image over L, (3,).
-        field_of_view: Vertical angle of view [rad].
     """
 
     position: Floats
     look_at: Floats
-    field_of_view: float = FIELD_OF_VIEW
 
     @classmethod
     def fit(
@@ -32,7 +38,7 @@ class Camera:
         *,
         planar: bool = False,
         aspect: float = 1.2,
-        insets: tuple[float, float, float, float] = (0.05, 0.05, 0.05, 0.05),
+        margins: tuple[float, float, float, float] = MARGINS,
     ) -> "Camera":
         """Return the nearest camera whose image contains all points, in the usual direction.
 
@@ -43,14 +49,16 @@ class Camera:
             points: Points over L, (n, 3).
             planar: Look from above, for bodies in 2D.
             aspect: Width over height of the image.
-            insets: Empty margins left, right, below and above, over width or height [-].
+            margins: Empty margins left, right, below and above, over width or height [-].
         """
         axes = _axes(-np.array(VIEW_2D if planar else VIEW_3D))
         x, y, z = axes @ points.T
         half = float(np.tan(FIELD_OF_VIEW / 2))
         left, right, below, above = (
-            size * (1 - 2 * inset)
-            for size, inset in zip((half * aspect, half * aspect, half, half), insets, strict=True)
+            size * (1 - 2 * margin)
+            for size, margin in zip(
+                (half * aspect, half * aspect, half, half), margins, strict=True
+            )
         )
         sides = [
             ((x - right * z).max(), (-x - left * z).max(), right, left),
@@ -67,14 +75,8 @@ class Camera:
         x, y, depth = np.moveaxis(
             (points - self.position) @ _axes(self.look_at - self.position).T, -1, 0
         )
-        scale = height / (2 * np.tan(self.field_of_view / 2))
+        scale = height / (2 * np.tan(FIELD_OF_VIEW / 2))
         return np.stack([width / 2 + scale * x / depth, height / 2 - scale * y / depth, depth], -1)
-
-
-def image_axes(*, planar: bool) -> tuple[Floats, Floats]:
-    """Return the directions to the right and upwards in the image of `Camera.fit`, (3,) each."""
-    right, up, _ = _axes(-np.array(VIEW_2D if planar else VIEW_3D))
-    return right, up
 
 
 def _axes(forward: Floats) -> Floats:
@@ -82,3 +84,86 @@ def _axes(forward: Floats) -> Floats:
     right = np.cross(forward, UP)
     axes = np.stack([right, np.cross(right, forward), forward])
     return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
+
+
+def image_axes(*, planar: bool) -> Floats:
+    """Return unit vectors to the right and upwards in the image of `Camera.fit`, (2, 3)."""
+    return _axes(-np.array(VIEW_2D if planar else VIEW_3D))[:2]
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Places of the body and of a second body that is compared with it.
+
+    Attributes:
+        planar: True for a body in 2D.
+        points: Points of the body at rest and under the largest loads, with arrows and labels,
+            over L, (n, 3).
+        offset: Position of the second body relative to the first over L, (3,).
+    """
+
+    planar: bool
+    points: Floats
+    offset: Floats
+
+    @classmethod
+    def of(cls, body: Body, node: int, radius: float) -> "Placement":
+        """Return the places for loads on the patch of a node with a radius over L."""
+        surface = body.surface
+        planar, rest = surface.planar, surface.undeformed
+        right, up = image_axes(planar=planar)
+        bare = np.concatenate([rest, surface.supports.vertices(rest)])
+        shapes = [bare]
+        for frame in largest_loads(body, node, radius):
+            shapes.append(np.concatenate([bare, frame.points, arrow_ends(surface, frame)]))
+        for k, shape in enumerate(shapes):
+            top = label_position(shape, rest, planar=planar) + LABEL[1] * up
+            shapes[k] = np.concatenate([shape, top[None]])
+        points = np.concatenate(shapes)
+        choices = []
+        for axis, along in ((up, np.eye(3)[1 if planar else 2]), (right, right)):
+            extent = max(float(np.ptp(shape @ axis)) for shape in shapes)
+            choices.append((extent + GAP) / float(along @ axis) * along)
+        places = [cls(planar, points, offset) for offset in choices]
+        return min(places, key=lambda place: _distance(place.camera(both=True)))
+
+    @property
+    def ground(self) -> float:
+        """Height of the ground over L, below all shapes."""
+        return float(self.points[:, 2].min()) - (0.01 if self.planar else 0.02)
+
+    def camera(
+        self, *, aspect: float = 1.2, both: bool = False, shown: Floats | None = None
+    ) -> Camera:
+        """Return a camera that shows one body or both, and points (n, 3) that are shown."""
+        points = self.points if shown is None else np.concatenate([self.points, shown])
+        if both:
+            points = np.concatenate([points, points + self.offset])
+        return Camera.fit(points, planar=self.planar, aspect=aspect)
+
+
+def _distance(camera: Camera) -> float:
+    return float(np.linalg.norm(camera.position - camera.look_at))
+
+
+def largest_loads(body: Body, node: int, radius: float) -> Iterator[Frame]:
+    """Yield the frames of the largest loads of the training along all axes and diagonals.
+
+    Frames with displacements above `MAX_DEFLECTION` are left out, since an untrained network can
+    predict any displacement.
+    """
+    patch, dim = body.patch(node, radius), body.scene.problem.shape[1]
+    axes = np.concatenate([np.eye(dim), -np.eye(dim)])
+    diagonals = np.array(list(itertools.product((-1.0, 1.0), repeat=dim)))
+    for direction in torch.from_numpy(np.concatenate([axes, diagonals])):
+        frame = body.solve(body.request(patch.force_along(direction, 1.0)), ViewSettings())
+        size = np.abs(frame.points - body.surface.undeformed).max()
+        if size <= MAX_DEFLECTION:  # False for values that are not finite
+            yield frame
+
+
+def label_position(shown: Floats, rest: Floats, *, planar: bool) -> Floats:
+    """Return a position above all shown points (n, 3), in the middle of the body at rest (S, 3)."""
+    _, up = image_axes(planar=planar)
+    middle = (rest.min(axis=0) + rest.max(axis=0)) / 2
+    return np.asarray(middle + (float((shown @ up).max()) + LABEL[0] - middle @ up) * up)

@@ -1,18 +1,30 @@
-"""Controls and readings in the panel of the page."""
+"""Panel of the page: controls, and readings as HTML. All text is escaped."""
 
+import html
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 from viser import ViserServer
 
 from dpl.fem import HasModes
-from dpl.viewer import panel
+from dpl.inference.answer import UNRELIABLE, relative
 from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, Frame, ViewSettings
 from dpl.viewer.recording import MAX_FRAMES, SUFFIXES, Recording
-from dpl.viewer.units import round_step, unit_for
+from dpl.viewer.renderer import N_BANDS, band_colours
+from dpl.viewer.units import engineering, round_step, scaled, tick_labels, unit_for
 
+GOOD, WARNING, BAD = "#15803d", "#b45309", "#b91c1c"
+ROW = (
+    '<div style="display:flex;justify-content:space-between;gap:12px;line-height:1.65">'
+    '<span style="opacity:.62">{}</span>'
+    '<span style="font-variant-numeric:tabular-nums;text-align:right;{}">{}</span></div>'
+)
+BOLD = "font-weight:600"
+BOX = '<div style="padding:2px 12px 6px;font-size:13.5px">{}</div>'
 LABELS = {"poisson": "Poisson's ratio"}  # of parameters
 NETWORK, BUDGET = "network", "best within the budget"
 PULL, GRASP = "pull", "grasp"
@@ -51,7 +63,7 @@ class Controls:
         nodes, dim = scene.problem.shape
         law = type(scene.problem.material).__name__
         about = f"{title} · {nodes * dim:,} degrees of freedom · {law}"
-        gui.add_html(panel.message(about, "inherit"))
+        gui.add_html(message(about, "inherit"))
         self._result, self._legend = gui.add_html(""), gui.add_html("")
         self._newton = gui.add_html("", visible=False)
         self._error = gui.add_html("")
@@ -61,7 +73,7 @@ class Controls:
             self._add_method_controls()
         with gui.add_folder("Record", expand_by_default=False):
             self.record = gui.add_button("Start recording", color="red")
-            self._state = gui.add_html(panel.message(f"Files are saved in {folder}", "inherit"))
+            self._state = gui.add_html(message(f"Files are saved in {folder}", "inherit"))
             self.save = gui.add_button_group("save as", tuple(SUFFIXES))
         self.follows_frame = False
         of_patch = (self.radius, self.axis, self.angle, self.sliding)
@@ -79,24 +91,24 @@ class Controls:
         first = min(max(RADIUS[PULL], low), high)
         self._radii = {PULL: first, GRASP: min(RADIUS[GRASP], high)}
         self.radius = gui.add_slider("radius / L", 0.0, high, 0.01, first)
-        upwards = (0.0, 1.0, 0.0) if body.scene.problem.shape[1] == 2 else (0.0, 0.0, 1.0)
+        upwards = (0.0, 1.0, 0.0) if body.surface.planar else (0.0, 0.0, 1.0)
         self.direction = gui.add_vector3("direction", upwards, step=0.1)
         self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
         self.axis = gui.add_dropdown("rotation axis", tuple(AXES), initial_value="y")
         self.angle = gui.add_slider("rotation [°]", -90.0, 90.0, 1.0, 0.0, marks=(-90, 0, 90))
         hint = "hold the patch along its normal alone, so that it slides in its plane"
         self.sliding = gui.add_checkbox("sliding", False, hint=hint)
-        self._young_unit = unit_for(body.young, "Pa")
-        low, high = (value / self._young_unit.factor for value in body.young_range)
-        label, middle = f"E [{self._young_unit.name}]", body.young / self._young_unit.factor
-        self.young = gui.add_slider(label, low, high, round_step(low, high), middle)
+        unit, self._young_unit = unit_for(body.young, "Pa")
+        low, high = (value / self._young_unit for value in body.young_range)
+        middle = body.young / self._young_unit
+        self.young = gui.add_slider(f"E [{unit}]", low, high, round_step(low, high), middle)
         stresses = {name: f"{name} [Pa]" for name in body.scene.problem.follower_loads.ranges}
         labels = LABELS | stresses
         self.parameters = {
-            name: gui.add_slider(labels.get(name, name), *ends, round_step(*ends), value)
-            for (name, ends), value in zip(
-                loads.parameter_ranges.items(), body.parameters.values(), strict=True
+            name: gui.add_slider(
+                labels.get(name, name), *ends, round_step(*ends), body.parameters[name]
             )
+            for name, ends in loads.parameter_ranges.items()
         }
         hint = "let a drag exceed the largest load of the training"
         self.unlimited = gui.add_checkbox("no limit", False, hint=hint)
@@ -123,32 +135,32 @@ class Controls:
     def show_mode(self) -> None:
         """Show the controls of the selected mode, with the last radius of this mode."""
         mode = self.mode.value
-        self._about.content = panel.message(ABOUT[mode], "inherit")
+        self._about.content = message(ABOUT[mode], "inherit")
         self._radii[self._shown_mode] = self.radius.value
         self.radius.value, self._shown_mode = self._radii[mode], mode
         for control in (self.direction, self.amplitude, self.unlimited, self.uniform):
             control.visible = mode == PULL
         self.angle.visible = self.sliding.visible = mode == GRASP
-        self.axis.visible = mode == GRASP and self._body.scene.problem.shape[1] == 3
+        self.axis.visible = mode == GRASP and not self._body.surface.planar
 
     @property
     def rotation(self) -> Tensor:
         """Rotation vector of the patch, (3,), in 2D the angle, (1,) [rad]."""
         angle = torch.tensor([self.angle.value]).double().deg2rad()
-        if self._body.scene.problem.shape[1] == 2:
+        if self._body.surface.planar:
             return angle
         return angle * torch.eye(3, dtype=torch.float64)[AXES[self.axis.value]]
 
     @property
     def modulus(self) -> float:
         """Young's modulus of the slider [Pa]; an assigned value is limited to its range."""
-        value = self.young.value * self._young_unit.factor
+        value = self.young.value * self._young_unit
         return float(np.clip(value, *self._body.young_range))
 
     @modulus.setter
     def modulus(self, value: float) -> None:
         within = float(np.clip(value, *self._body.young_range))
-        self.young.value = within / self._young_unit.factor
+        self.young.value = within / self._young_unit
 
     def settings(self) -> ViewSettings:
         """Return method and quantity.
@@ -170,23 +182,19 @@ class Controls:
 
         `node` is the node whose displacement is shown.
         """
-        self._result.content = panel.result_table(frame, frame_rate, node)
-        self._legend.content = panel.legend(frame, top)
+        self._result.content = result_table(frame, frame_rate, node)
+        self._legend.content = legend(frame, top)
         if self.follows_frame and frame.answer is not None:
             limit = float(self.amplitude.max)
             self.amplitude.value = round(min(float(frame.answer.amplitude), limit), 2)
 
     def show_newton_frame(self, frame: Frame | None, visible: bool) -> None:
         """Update the table of Newton, or hide it."""
-        self._newton.content, self._newton.visible = panel.newton_table(frame), visible
+        self._newton.content, self._newton.visible = newton_table(frame), visible
 
-    def show_error(self, text: str) -> None:
-        """Show why a request cannot be solved; an empty text removes the message."""
-        self._error.content = panel.message(text, panel.BAD)
-
-    def show_progress(self, seconds: float) -> None:
-        """Show for how long the solve in progress has taken [s]."""
-        self._error.content = panel.message(f"Solving for {seconds:.0f} s ...")
+    def show_problem(self, text: str, colour: str = BAD) -> None:
+        """Show why a request is not solved; an empty text removes the message."""
+        self._error.content = message(text, colour)
 
     def show_recording(self, recording: Recording) -> None:
         """Update the label of the record button."""
@@ -196,6 +204,124 @@ class Controls:
         if running:
             self.show_state(f"{count} frames", "inherit")
 
-    def show_state(self, text: str, colour: str = panel.WARNING) -> None:
+    def show_state(self, text: str, colour: str = WARNING) -> None:
         """Show a message below the record button."""
-        self._state.content = panel.message(text, colour)
+        self._state.content = message(text, colour)
+
+
+def result_table(frame: Frame, frame_rate: float, node: int) -> str:
+    """Return forces, method, time, residual, range check and summary of a result of the simulator.
+
+    `node` is the node whose displacement is shown, the centre of the patch.
+    """
+    answer, grasp = frame.answer, frame.grasp
+    assert answer is not None
+    colour = GOOD if frame.converged else WARNING if frame.volume_ratio > 0 else BAD
+    unit = "N" if frame.displacement.shape[1] == 3 else "N/m"
+    if grasp is None:
+        rows = [("total force", _size(frame.load.force.sum(dim=0), unit), BOLD)]
+    else:
+        rows = [
+            ("force of the gripper", _size(grasp.force, unit), BOLD),
+            ("moment of the gripper", _size(grasp.moment, "N m" if unit == "N" else "N"), BOLD),
+            ("motion error", engineering(grasp.motion_error, "m"), ""),
+        ]
+    residual = f"{frame.residual:.1e}" if frame.residual else "0"
+    rows += [
+        ("displacement at the hand", _size(frame.displacement[node], "m"), BOLD),
+        ("computed by", str(answer.method), BOLD),
+        ("time", f"{answer.milliseconds:.1f} ms, {frame_rate:.0f} fps", ""),
+        ("estimated error", relative(float(answer.error)), f"color:{colour}"),
+        ("residual ‖R‖/‖f‖", residual, f"color:{colour}"),
+        ("min det F", f"{frame.volume_ratio:.3f}", ""),
+        ("linear solves" if grasp is None else "iterations", f"{answer.iterations}", ""),
+    ]
+    outside = answer.out_of_distribution
+    if grasp is None or outside:  # the forces of a good grasp may have any place
+        place = "outside" if outside else "unknown" if np.isnan(answer.out_of_span) else "inside"
+        span = f"{place}, amplitude {answer.amplitude:.2f}"
+        rows.append(("training range", span, f"color:{BAD if outside else GOOD}"))
+    summary = (
+        f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
+        f'{colour};background:{colour}14;line-height:1.35">{html.escape(answer.summary)}</div>'
+    )
+    return BOX.format(_rows(rows) + summary)
+
+
+def _size(vector: ArrayLike, unit: str) -> str:
+    return engineering(float(np.linalg.norm(np.asarray(vector))), unit)
+
+
+def _rows(rows: Iterable[tuple[str, str, str]]) -> str:
+    """Return rows of a table: name, value and style of the value."""
+    return "".join(
+        ROW.format(html.escape(name), style, html.escape(value)) for name, value, style in rows
+    )
+
+
+def problem_of(frame: Frame, *, has_budget: bool = False) -> str:
+    """Return why a frame cannot be used, in one line; empty if it can.
+
+    With a budget the user has chosen the time after which a grasp stops, so that this is no reason.
+    """
+    if not frame.volume_ratio > 0:
+        return "Not valid: an element is inverted. Move the hand back."
+    grasp = frame.grasp
+    if grasp is not None and grasp.stopped and not has_budget:
+        return (
+            f"Not solved: stopped after {grasp.milliseconds / 1e3:.1f} s with an estimated error "
+            f"of {relative(grasp.error)}. Move the hand back."
+        )
+    if grasp is None or grasp.error < UNRELIABLE:
+        return ""
+    apart = engineering(grasp.motion_error, "m")
+    return (
+        f"Not reliable: estimated error {relative(grasp.error)}, the patch is {apart} away from "
+        "the hand. Move the hand back, or select a residual as method."
+    )
+
+
+def newton_table(frame: Frame | None) -> str:
+    """Return state, iteration and residual of an iterate of Newton; None before the first."""
+    if frame is None:
+        return BOX.format(_rows([("Newton from zero", "starts when the load is constant", "")]))
+    colour, state = (GOOD, "converged") if frame.converged else (WARNING, "iterating")
+    rows = [
+        ("Newton from zero", state, f"color:{colour};{BOLD}"),
+        ("iteration", str(frame.iteration), ""),
+        ("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{colour}"),
+    ]
+    return BOX.format(_rows(rows))
+
+
+def legend(frame: Frame, top: float) -> str:
+    """Return the colour bar, which ends at `top`, and the range of the values on the surface.
+
+    The result is empty if the bar would end at 0: all values are zero and the body is neutral.
+    """
+    if top <= 0:
+        return ""
+    quantity = frame.quantity
+    unit, size, labels = tick_labels(top, QUANTITIES[quantity])
+    finite = frame.values[np.isfinite(frame.values)]
+    low, high = (finite.min(), finite.max()) if len(finite) else (0.0, 0.0)
+    cells = "".join(
+        f'<span style="flex:1;background:rgb({r},{g},{b})"></span>'
+        for r, g, b in band_colours(quantity).tolist()
+    )
+    ticks = "".join(f"<span>{label}</span>" for label in labels)
+    span = f"{scaled(low, size)} to {scaled(high, size)} {unit}"
+    return BOX.format(
+        f'<div style="display:flex;justify-content:space-between;margin-bottom:4px">'
+        f"<b>{html.escape(f'{quantity} [{unit}]')}</b>"
+        f'<span style="opacity:.62">{N_BANDS} bands</span></div>'
+        f'<div style="display:flex;height:14px;border-radius:3px;overflow:hidden">{cells}</div>'
+        f'<div style="display:flex;justify-content:space-between;font-size:11.5px;opacity:.75">'
+        f"{ticks}</div>" + _rows([("on the surface", span, "")])
+    )
+
+
+def message(text: str, colour: str = WARNING) -> str:
+    """Return a line of text."""
+    style = f"padding:2px 12px 6px;font-size:13px;color:{colour};line-height:1.35"
+    return f'<div style="{style}">{html.escape(text)}</div>' if text else ""

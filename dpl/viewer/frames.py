@@ -1,6 +1,5 @@
 """Requests, solutions and the surface values that the viewer shows; independent of the browser."""
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -14,15 +13,17 @@ from dpl.fem import Solution, moduli_of
 from dpl.fem.solvers import check_tol
 from dpl.inference import Answer, GraspAnswer, Simulator
 from dpl.system.threads import one_thread
-from dpl.viewer.drag_loads import Patch
-from dpl.viewer.requests import GraspRequest, LoadRequest, ViewRequest
-from dpl.viewer.surface import Floats, Surface
+from dpl.viewer.requests import GraspRequest, LoadRequest, Patch, ViewRequest
+from dpl.viewer.surface import Floats, Surface, exit_distance
 
 STRESS, ERROR = "von Mises stress", "error against FE"
 QUANTITIES = {"displacement": "m", STRESS: "Pa", ERROR: "m"}  # units without prefix
 TOLERANCES = (1e-3, 1e-6, 1e-8)  # relative residuals that the page offers
 YOUNG_FACTOR = 4.0  # range of E on the page, down and up, if the scene has a single value
 SAMPLE_STREAM = (0, 11)  # random stream of the loads that the page draws
+ARROW_LENGTH = 0.09, 0.07  # length at amplitude 0 and its increase per amplitude, over L [-]
+MAX_AMPLITUDE = 2.0  # amplitude of the longest arrow [-]
+BALANCED = 1e-6  # total force over the sum of nodal forces below which there is no direction
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,6 @@ class ViewSettings:
     show_newton: bool = False
 
     def __post_init__(self) -> None:
-        """Check quantity and tolerance; the simulator checks the budget.
-
-        Raises:
-            ValueError: The quantity is unknown, or the tolerance is out of range.
-        """
         if self.quantity not in QUANTITIES:
             raise ValueError(f"quantity = {self.quantity!r} must be {' or '.join(QUANTITIES)}")
         if self.tol is not None:
@@ -136,29 +132,49 @@ class Body:
             return low, high
         return low / YOUNG_FACTOR, high * YOUNG_FACTOR
 
-    def request(
-        self,
-        force: Tensor,
-        young: float | None = None,
-        parameters: Mapping[str, float] | None = None,
-    ) -> LoadRequest:
+    def request(self, force: Tensor) -> LoadRequest:
         """Return the request of a dimensionless force (N, D) plus the constant force of the scene.
 
-        The force [N] does not depend on `young`, so that a softer body has larger displacements.
-
-        Raises:
-            ValueError: A value is out of its range.
+        The force [N] is that at the default modulus, so that a softer body has larger
+        displacements.
         """
         constant = self.scene.loads.constant_force
         total = force if constant is None else force + constant
         newtons = total * (self.young * self.scene.force_unit)
-        return LoadRequest(newtons, *self._checked_moduli(young, parameters))
+        return LoadRequest(newtons, self.young, self.parameters)
 
-    def _checked_moduli(
-        self, young: float | None, parameters: Mapping[str, float] | None
-    ) -> tuple[float, dict[str, float]]:
-        """Return Young's modulus [Pa] and the parameters of the law; defaults replace None."""
-        young = self.young if young is None else young
+    def zero_load(self) -> LoadRequest:
+        """Return the request without a force of the user."""
+        return self.request(torch.zeros(self.scene.problem.shape, dtype=torch.float64))
+
+    def grasp(
+        self, nodes: Tensor, translation: Tensor, rotation: Tensor, *, sliding: bool = False
+    ) -> GraspRequest:
+        """Return the request of a grasp, with the constant force of the scene.
+
+        Args:
+            nodes: Mask of the nodes of the patch, (N,).
+            translation, rotation: See `GraspRequest`.
+            sliding: See `GraspRequest`.
+
+        Raises:
+            ValueError: The patch is empty.
+        """
+        if not nodes.any():
+            lacks = "facet across x, y or z" if sliding else "free node"
+            raise ValueError(
+                f"the patch has no {lacks} of the boundary; click another place or enlarge radius"
+            )
+        return GraspRequest(nodes, translation, rotation, self.zero_load(), sliding)
+
+    def with_moduli(
+        self, request: ViewRequest, young: float, parameters: Mapping[str, float] | None = None
+    ) -> ViewRequest:
+        """Return a request with Young's modulus [Pa] and values of the ranges of the law, by name.
+
+        Raises:
+            ValueError: A value is out of its range.
+        """
         low, high = self.young_range
         if not low * (1 - 1e-9) <= young <= high * (1 + 1e-9):
             raise ValueError(f"young = {young:g} must lie between {low:g} and {high:g} Pa")
@@ -166,44 +182,7 @@ class Body:
         for name, (low, high) in self.scene.loads.parameter_ranges.items():
             if not low <= parameters[name] <= high:
                 raise ValueError(f"{name} = {parameters[name]:g} must lie between {low} and {high}")
-        return young, parameters
-
-    def zero_load(
-        self, young: float | None = None, parameters: Mapping[str, float] | None = None
-    ) -> LoadRequest:
-        """Return the request without a force of the user."""
-        force = torch.zeros(self.scene.problem.shape, dtype=torch.float64)
-        return self.request(force, young, parameters)
-
-    def grasp(
-        self,
-        nodes: Tensor,
-        translation: Tensor,
-        rotation: Tensor,
-        young: float | None = None,
-        parameters: Mapping[str, float] | None = None,
-        *,
-        sliding: bool = False,
-    ) -> GraspRequest:
-        """Return the request of a grasp, with the constant force of the scene.
-
-        Args:
-            nodes: Mask of the nodes of the patch, (N,).
-            translation, rotation: See `GraspRequest`.
-            young: Young's modulus [Pa].
-            parameters: Value of each range of the law, by name.
-            sliding: See `GraspRequest`.
-
-        Raises:
-            ValueError: A value is out of its range, or the patch is empty.
-        """
-        if not nodes.any():
-            lacks = "facet across x, y or z" if sliding else "free node"
-            raise ValueError(
-                f"the patch has no {lacks} of the boundary; click another place or enlarge radius"
-            )
-        others = self.zero_load(young, parameters)
-        return GraspRequest(nodes, translation, rotation, others, sliding)
+        return request.with_moduli(young, parameters)
 
     def sample(self, index: int) -> LoadRequest:
         """Return a random load of the training distribution."""
@@ -276,30 +255,22 @@ class Body:
         )
 
 
-class ColourScale:
-    """Colour scale from 0 to a rounded maximum that changes only with large changes of the values.
+def arrow_ends(surface: Surface, frame: Frame) -> Floats:
+    """Return start and end of the arrow over L, (2, 3); (0, 3) if the total force is zero.
 
-    Attributes:
-        top: Upper end; 0 before the first values.
+    The axis of the arrow passes through the centre of the nodal forces. The arrow starts where its
+    axis leaves the body, so that the body does not hide it; in 2D it starts at the centre.
     """
-
-    def __init__(self) -> None:
-        """Start without an upper end."""
-        self.top = 0.0
-
-    def update(self, values: Floats) -> float:
-        """Return the upper end for values; values that are not finite are ignored."""
-        finite = values[np.isfinite(values)]
-        largest = float(finite.max()) if len(finite) else 0.0
-        if largest > self.top or largest < 0.4 * self.top:
-            self.top = round_up(largest)
-        return self.top
-
-
-def round_up(number: float) -> float:
-    """Return the smallest number {1, 1.5, 2, 3, 4, 5, 6, 8} x 10^k that is not smaller."""
-    if not 0 < number < math.inf:
-        return 0.0
-    power = 10.0 ** math.floor(math.log10(number))
-    steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-    return power * next((step for step in steps if number <= step * power * (1 + 1e-9)), 10.0)
+    force = frame.hand_force.numpy()
+    total = np.pad(force.sum(axis=0), (0, 3 - force.shape[1]))
+    sizes = np.linalg.norm(force, axis=1)
+    if not np.linalg.norm(total) > BALANCED * sizes.sum():
+        return np.zeros((0, 3))
+    direction = total / np.linalg.norm(total)
+    points = np.nan_to_num(frame.points)
+    weights = sizes[surface.nodes] if sizes[surface.nodes].any() else np.ones(len(points))
+    centre = weights @ points / weights.sum()
+    start = centre + exit_distance(points, surface.triangles, centre, direction) * direction
+    amplitude = min(max(frame.amplitude, 0.0), MAX_AMPLITUDE)
+    length = ARROW_LENGTH[0] + ARROW_LENGTH[1] * amplitude
+    return np.stack([start, start + length * direction])

@@ -1,115 +1,95 @@
 """Modes of a drag: the hand pulls the body by a load on a patch, or grasps the patch."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dpl.viewer.controls import Controls
-from dpl.viewer.drag_loads import Patch
 from dpl.viewer.frames import Body, Frame
-from dpl.viewer.requests import GraspRequest, LoadRequest, ViewRequest
-
-MakeRequest = Callable[[float, Mapping[str, float]], ViewRequest]  # E [Pa], parameters -> request
+from dpl.viewer.requests import MakeRequest, Patch
 
 
-class Hand(Protocol):
-    """A mode of a drag."""
+class Hand:
+    """A mode of a drag, which converts drags and sliders to requests."""
+
+    def __init__(self, body: Body, controls: Controls) -> None:
+        """Store the body and the controls of the patch."""
+        self._body, self._controls = body, controls
+        self._start = torch.zeros(body.scene.problem.shape[1]).double()  # at the begin of a drag
 
     def take(self, node: int, frame: Frame) -> int:
         """Begin a drag at a node of the shown body; return the node at the centre of the patch."""
-        ...
+        raise NotImplementedError
 
     def move(self, motion: Tensor) -> MakeRequest:
         """Return the request after a motion of the mouse over L, (D,) [-], since `take`."""
-        ...
+        raise NotImplementedError
 
     def hold(self, node: int, frame: Frame | None) -> MakeRequest:
         """Return the request of the sliders for the patch of a node of the shown body."""
-        ...
+        raise NotImplementedError
 
     def release(self) -> None:
         """Forget the patch, because another load replaces the request."""
-        ...
 
     def marked_nodes(self, node: int) -> Tensor:
         """Mask of the nodes of the patch of a node, (N,)."""
-        ...
+        raise NotImplementedError
 
 
-class PullingHand:
+class PullingHand(Hand):
     """Converts drags and sliders to modal loads on a patch."""
 
-    def __init__(self, body: Body, controls: Controls) -> None:
-        """Store the body and the controls of the load."""
-        self._body, self._controls = body, controls
-        self._node, self._start = 0, torch.zeros(body.scene.problem.shape[1]).double()
-
     def take(self, node: int, frame: Frame) -> int:
-        """See `Hand`; the patch moves to the node."""
+        """Move the patch to the node."""
         self._node, self._start = node, frame.displacement[node] / self._body.scene.length
         return node
 
     def move(self, motion: Tensor) -> MakeRequest:
         """Return the load whose linear response moves the dragged point to the mouse."""
-        target, patch = self._start + motion, self._patch(self._node)
-        max_amplitude = None if self._controls.unlimited.value else 1.0
-        self._show_direction(target)
-        return self._request(lambda: patch().force_towards(target, max_amplitude=max_amplitude))
-
-    def _show_direction(self, target: Tensor) -> None:
-        """Set direction and, with the next frame, amplitude to those of a drag."""
+        target, controls = self._start + motion, self._controls
         size = float(target.norm())
         if size > 0:
             direction = np.pad((target / size).numpy(), (0, 3 - len(target)))
-            self._controls.direction.value = tuple(direction.round(2).tolist())
-        self._controls.follows_frame = True
+            controls.direction.value = tuple(direction.round(2).tolist())
+        controls.follows_frame = True
+        limit, patch = None if controls.unlimited.value else 1.0, self._patch(self._node)
+        return self._request(partial(patch.force_towards, target, max_amplitude=limit))
 
     def hold(self, node: int, frame: Frame | None) -> MakeRequest:
         """Return the load of the sliders for direction and amplitude."""
         self._controls.follows_frame = False
-        patch, amplitude = self._patch(node), self._controls.amplitude.value
-        dim = self._body.scene.problem.shape[1]
-        direction = torch.tensor(self._controls.direction.value[:dim]).double()
-        return self._request(lambda: patch().force_along(direction, amplitude))
-
-    def release(self) -> None:
-        """Do nothing: each drag and each slider gives a load of its own."""
+        direction = torch.tensor(self._controls.direction.value[: len(self._start)]).double()
+        amplitude = self._controls.amplitude.value
+        return self._request(partial(self._patch(node).force_along, direction, amplitude))
 
     def marked_nodes(self, node: int) -> Tensor:
         """Mask of the loaded nodes, (N,)."""
-        return self._patch(node)().node_mask
+        return self._patch(node).node_mask
 
-    def _patch(self, node: int) -> Callable[[], Patch]:
-        """Return a function that makes the patch of a node with the values of the controls."""
+    def _patch(self, node: int) -> Patch:
         controls = self._controls
-        radius, uniform = controls.radius.value, controls.uniform.value
-        return partial(self._body.patch, node, radius, uniform=uniform)
+        return self._body.patch(node, controls.radius.value, uniform=controls.uniform.value)
 
     def _request(self, make_force: Callable[[], Tensor]) -> MakeRequest:
         """Return the request of a dimensionless force (N, D), which the worker makes."""
-
-        def make(young: float, parameters: Mapping[str, float]) -> LoadRequest:
-            return self._body.request(make_force(), young, parameters)
-
-        return make
+        return lambda: self._body.request(make_force())
 
 
-class GraspingHand:
+class GraspingHand(Hand):
     """Converts drags and sliders to rigid motions of a patch, which it holds until `release`."""
 
     def __init__(self, body: Body, controls: Controls) -> None:
-        """Store the body and the controls of the grasp."""
-        self._body, self._controls = body, controls
+        """Store the body and the controls of the patch."""
+        super().__init__(body, controls)
         self._node: int | None = None  # at the centre of the held patch
-        self._translation = torch.zeros(body.scene.problem.shape[1]).double()
-        self._start = self._translation  # at the begin of the drag
+        self._translation = self._start
 
     def take(self, node: int, frame: Frame) -> int:
-        """See `Hand`; a drag within the held patch keeps it."""
+        """Hold the patch of the node; a drag within the held patch keeps it."""
         if self._node is None or not self._patch(self._node).node_mask[node]:
             self._grip(node, frame)
         self._start = self._translation
@@ -149,13 +129,8 @@ class GraspingHand:
     def _request(self) -> MakeRequest:
         """Return the request of the held patch with the rotation of the controls."""
         assert self._node is not None
-        self._controls.follows_frame = False
-        nodes, sliding = self.marked_nodes(self._node), bool(self._controls.sliding.value)
-        translation, rotation = self._translation, self._controls.rotation
-
-        def make(young: float, parameters: Mapping[str, float]) -> GraspRequest:
-            return self._body.grasp(
-                nodes, translation, rotation, young, parameters, sliding=sliding
-            )
-
-        return make
+        controls = self._controls
+        controls.follows_frame = False
+        nodes, sliding = self.marked_nodes(self._node), bool(controls.sliding.value)
+        motion = self._translation, controls.rotation
+        return partial(self._body.grasp, nodes, *motion, sliding=sliding)

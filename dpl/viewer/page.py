@@ -3,7 +3,6 @@
 import contextlib
 import io
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +10,15 @@ import numpy as np
 import torch
 import viser
 
-from dpl.viewer import panel
 from dpl.viewer.access import AccessPolicy, check_server, serve_with
-from dpl.viewer.body_node import BodyNode, LocalServer
-from dpl.viewer.controls import GRASP, PULL, Controls
-from dpl.viewer.environment import add_environment, move_camera
-from dpl.viewer.frames import Body, ColourScale, Frame
-from dpl.viewer.hands import GraspingHand, Hand, MakeRequest, PullingHand
-from dpl.viewer.layout import Layout
-from dpl.viewer.load_marker import LoadMarker
+from dpl.viewer.camera import UP, Placement
+from dpl.viewer.controls import BAD, GOOD, GRASP, PULL, WARNING, Controls, problem_of
+from dpl.viewer.frames import Body, Frame
+from dpl.viewer.hands import GraspingHand, Hand, PullingHand
+from dpl.viewer.nodes import BodyNode, LoadMarker, LocalServer, add_environment
 from dpl.viewer.recording import SUFFIXES, Recording
+from dpl.viewer.renderer import ColourScale
+from dpl.viewer.requests import MakeRequest
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
@@ -36,8 +34,8 @@ class Page:
         body: The body.
         worker: Thread that solves.
         server: viser server.
-        layout: Places of the bodies and cameras that show them.
-        controls: Widgets of the panel.
+        placement: Places of the bodies and cameras that show them.
+        controls: Controls of the panel.
         recording: Recording of the shown frames.
         folder: Folder of recordings.
         frame: The most recent frame, if there is one.
@@ -73,7 +71,7 @@ class Page:
             PULL: PullingHand(body, self.controls),
             GRASP: GraspingHand(body, self.controls),
         }
-        self.layout = Layout.of(body, self.node, self.controls.radius.value)
+        self.placement = Placement.of(body, self.node, self.controls.radius.value)
         self._build_scene()
         self._connect()
         self._mark_patch()
@@ -98,23 +96,19 @@ class Page:
 
     def _build_scene(self) -> None:
         server, surface = self.server, self.body.surface
-        add_environment(server, self.layout, surface)
-        self._body_node = BodyNode(server, "/body", surface, "selected method", draggable=True)
+        add_environment(server, self.placement, surface)
+        self._body_node = BodyNode(server, "/body", surface, "selected method")
         self._body_node.label.visible = False
-        self._newton_node = BodyNode(
-            server, "/newton", surface, "Newton from zero", draggable=False
-        )
-        self._newton_node.frame.position = self.layout.offset
+        self._newton_node = BodyNode(server, "/newton", surface, "Newton from zero")
+        self._newton_node.frame.position = self.placement.offset
         self._newton_node.frame.visible = False
         self._marker = LoadMarker(server, surface)
 
     def _connect(self) -> None:
         """Connect the events of the browser with the methods below."""
         controls, catch = self.controls, self._policy.log.catch_errors
-        drag_mesh = self._body_node.drag_mesh
-        assert drag_mesh is not None
-        drag_mesh.on_drag("left")(catch(self.drag))
-        drag_mesh.on_click(catch(self.click))
+        self._marker.drag_mesh.on_drag("left")(catch(self.drag))
+        self._marker.drag_mesh.on_click(catch(self.click))
         for control, callback in (
             *((control, self.apply_controls) for control in controls.of_load),
             *((control, self._apply_moduli) for control in controls.of_moduli),
@@ -192,7 +186,7 @@ class Page:
         self._release()
         loaded = request.force.any(dim=1).numpy()[self.body.surface.nodes]
         self.node = self.body.surface.middle_node(loaded)
-        self._submit(lambda young, given: request._replace(young=young, parameters=given))
+        self._submit(lambda: request)
         self._marker.mask = loaded
 
     def reset(self, event: Any) -> None:
@@ -208,14 +202,10 @@ class Page:
         old, settings = self.worker.settings, self.controls.settings()
         if settings.quantity != old.quantity:
             self._scale = ColourScale()
-        if settings.show_newton != old.show_newton:
-            self._show_second_body(settings.show_newton)
+        if (visible := settings.show_newton) != old.show_newton:
+            self._newton_node.frame.visible = self._body_node.label.visible = visible
+            self.fit(None)
         self.worker.submit(settings=settings)
-
-    def _show_second_body(self, visible: bool) -> None:
-        """Show or hide the body of Newton, and move the cameras."""
-        self._newton_node.frame.visible = self._body_node.label.visible = visible
-        self.fit(None)
 
     def fit(self, event: Any) -> None:
         """Move the cameras of all browsers so that they show all that is shown."""
@@ -224,12 +214,15 @@ class Page:
 
     def _fit_client(self, client: viser.ClientHandle) -> None:
         """Move the camera of a browser so that it shows all that is shown."""
-        camera = self.layout.camera(
+        camera = self.placement.camera(
             aspect=client.camera.aspect,
             both=self.controls.show_newton.value,
             shown=None if self.frame is None else np.nan_to_num(self.frame.points),
         )
-        move_camera(client, camera)
+        with client.atomic():
+            client.camera.up_direction = UP
+            client.camera.position = camera.position
+            client.camera.look_at = camera.look_at
 
     def _toggle_recording(self, event: Any) -> None:
         (self.recording.stop if self.recording.running else self.recording.start)()
@@ -247,19 +240,19 @@ class Page:
                 path = self.recording.save_animation(self.folder, suffix)
                 if event.client is not None:
                     event.client.send_file_download(path.name, path.read_bytes())
-            self.controls.show_state(f"Written: {path}", panel.GOOD)
+            self.controls.show_state(f"Written: {path}", GOOD)
         except (ValueError, OSError) as error:
-            self.controls.show_state(str(error), panel.BAD)
+            self.controls.show_state(str(error), BAD)
 
     # --- requests to the worker and its results
 
     def _submit(self, make_request: MakeRequest | None = None) -> None:
         """Submit a request, or the last one, with the moduli of the sliders."""
-        self._make_request = make_request or self._make_request
-        sliders = self.controls.parameters
+        make = self._make_request = make_request or self._make_request
+        sliders, young = self.controls.parameters, self.controls.modulus
         parameters = {name: slider.value for name, slider in sliders.items()}
         self._mark_patch()  # first, so that it does not remove an error of this request
-        self.worker.submit(partial(self._make_request, self.controls.modulus, parameters))
+        self.worker.submit(lambda: self.body.with_moduli(make(), young, parameters))
 
     def _mark_patch(self) -> None:
         """Mark the nodes of the patch and remove the error message."""
@@ -288,7 +281,7 @@ class Page:
     def refresh(self) -> None:
         """Update the readings of the panel; to be called a few times per second."""
         if (seconds := self.worker.solving_time) > SLOW:
-            self.controls.show_progress(seconds)
+            self.controls.show_problem(f"Solving for {seconds:.0f} s ...", WARNING)
             self._changed = True
         elif self._changed and self.frame is not None:
             self._show_readings(self.frame)
@@ -299,5 +292,5 @@ class Page:
         self.controls.show_frame(frame, self._scale.top, self.worker.frame_rate, self.node)
         self.controls.show_newton_frame(self.newton_frame, self.worker.settings.show_newton)
         has_budget = self.worker.settings.budget_ms is not None
-        self.controls.show_error(self._error or panel.problem_of(frame, has_budget=has_budget))
+        self.controls.show_problem(self._error or problem_of(frame, has_budget=has_budget))
         self.controls.show_recording(self.recording)

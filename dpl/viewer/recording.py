@@ -1,5 +1,6 @@
-"""Recordings of frames: series for ParaView and animations."""
+"""Recordings of frames: series for ParaView and animations, and one of a rotating load."""
 
+import math
 import threading
 from collections.abc import Callable, Iterator
 from itertools import groupby
@@ -15,13 +16,22 @@ from dpl.evaluation.nodal_fields import nodal_fields
 from dpl.fem import write_mesh
 from dpl.fem.mesh import write_collection
 from dpl.system.files import atomic_write
-from dpl.viewer.frames import Body, ColourScale, Frame
-from dpl.viewer.load_arrow import ARROW_COLOUR
-from dpl.viewer.renderer import BACKGROUND, NEUTRAL, TEXT, Renderer, band_colours
+from dpl.viewer.frames import STRESS, Body, Frame, ViewSettings
+from dpl.viewer.renderer import (
+    ARROW_COLOUR,
+    BACKGROUND,
+    NEUTRAL,
+    TEXT,
+    ColourScale,
+    Renderer,
+    band_colours,
+)
 
 MAX_FRAMES = 900  # frames of a recording, 30 s at 30 frames per second
 FRAME_RATE = 20  # frames per second of an animation
 FORMATS = (".gif", ".mp4")
+DURATION = 5  # of the animation of a rotating load [s]
+RADIUS, DEFLECTION = 0.45, 0.33  # of its patch, and linear displacement of its centre, over L [-]
 SUFFIXES = {"VTU": ".pvd", "GIF": ".gif", "MP4": ".mp4"}
 
 
@@ -120,8 +130,7 @@ def resample(frames: list[tuple[float, Frame]]) -> list[Frame]:
 def default_captions(frame: Frame) -> list[str]:
     """Return the lines of text for a frame of a recording."""
     answer = frame.answer
-    if answer is None:
-        return [f"Newton, iteration {frame.iteration}", f"relative residual {frame.residual:.1e}"]
+    assert answer is not None
     return [
         f"{answer.method} · {answer.milliseconds:.1f} ms",
         f"relative residual {frame.residual:.1e}",
@@ -196,3 +205,55 @@ def _palette(quantities: set[str]) -> Image.Image:
     image = Image.new("P", (1, 1))
     image.putpalette(colours.astype(np.uint8).tobytes())
     return image
+
+
+def animate_load(body: Body, path: Path, *, size: tuple[int, int] = (720, 405)) -> None:
+    """Write a looping animation of the network's predictions for a load that rotates once.
+
+    The load acts on a patch around the point farthest from the supports. Colours show the von Mises
+    stress. The caption has the median time, and residual and error of each frame. `path` ends with
+    .gif or .mp4; `size` is width and height [pixel].
+    """
+    frames = circular_load(body)
+    median = float(np.median([frame.answer.milliseconds for frame in frames if frame.answer]))
+    count = math.prod(body.scene.problem.shape)
+
+    def captions(frame: Frame) -> list[str]:
+        exact = body.solve(frame.request, ViewSettings(tol=body.scene.solver.tol)).displacement
+        error = float((frame.displacement - exact).norm() / exact.norm().clamp(min=1e-300))
+        return [
+            f"sim(force): {median:.1f} ms",
+            f"{count:,} degrees of freedom",
+            f"relative residual {frame.residual:.1e}",
+            f"displacement error {100 * error:.1g} %",
+        ]
+
+    write_animation(path, frames, Renderer.fitting(body.surface, frames, size), captions)
+
+
+def circular_load(body: Body) -> list[Frame]:
+    """Return the predictions for a load that rotates once in `DURATION`.
+
+    The load acts at the node farthest from the fixed nodes. It rotates in the plane of the two
+    smallest extents of the body; in 2D it oscillates along the smallest one.
+    """
+    patch = body.patch(_farthest_node(body), RADIUS)
+    points = body.scene.problem.points.numpy()
+    axes = np.argsort(np.ptp(points, axis=0))[: points.shape[1] - 1]
+    settings = ViewSettings(quantity=STRESS)
+    frames, count = [], DURATION * FRAME_RATE
+    for k in range(count):
+        angle = 2 * math.pi * k / count
+        target = torch.zeros(points.shape[1], dtype=torch.float64)
+        for axis, component in zip(axes.tolist(), (math.sin(angle), math.cos(angle)), strict=False):
+            target[axis] = DEFLECTION * component
+        frames.append(body.solve(body.request(patch.force_towards(target)), settings))
+    return frames
+
+
+def _farthest_node(body: Body) -> int:
+    """Return the surface node in the middle of those that are farthest from the fixed nodes."""
+    problem, points = body.scene.problem, body.scene.problem.points[body.surface.nodes]
+    fixed = problem.points[~problem.free.any(dim=1)]
+    distance = torch.cdist(points, fixed).amin(dim=1) if len(fixed) else points[:, 0]
+    return body.surface.middle_node((distance > 0.99 * distance.max()).numpy())

@@ -1,8 +1,8 @@
 """Images of frames without a display: the body from far to near, its load and a legend."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import matplotlib
@@ -17,20 +17,19 @@ from PIL import Image
 
 from dpl.fem.postprocess import triangle_normals
 from dpl.viewer.camera import Camera
-from dpl.viewer.frames import QUANTITIES, Frame
-from dpl.viewer.load_arrow import ARROW_COLOUR, arrow_ends
-from dpl.viewer.supports import SUPPORT_COLOUR, SupportSymbols
+from dpl.viewer.frames import QUANTITIES, Frame, arrow_ends
 from dpl.viewer.surface import Floats, Surface, contour_bands, vertex_normals
-from dpl.viewer.units import scaled, unit_of_scale
+from dpl.viewer.units import tick_labels
 
 COLOUR_MAPS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
-INSETS = (0.03, 0.13, 0.05, 0.17)  # margins for legend (right) and captions (above) [-]
+MARGINS = (0.03, 0.13, 0.05, 0.17)  # margins for legend (right) and captions (above) [-]
 MAX_FITTED = 100  # frames to which a camera is fitted
 SEAM, LINE = 0.5, 0.9  # width of the sides of triangles, which closes gaps, and of lines [point]
 N_BANDS = 12
 NEUTRAL = (188, 194, 204)  # colour of a body at rest
 GRAZING = -0.2  # smallest distance of the camera above a visible face, over L
 BACKGROUND, TEXT, TEXT_GREY, OUTLINE = "#fafafc", "#202430", "#464a58", "#cdd1da"
+ARROW_COLOUR, SUPPORT_COLOUR = (200, 24, 45), (71, 85, 105)
 Bytes = NDArray[np.uint8]
 
 
@@ -47,6 +46,35 @@ def colour_bands(surface: Surface, frame: Frame, top: float) -> list[Floats]:
     """Return the corners of the triangles of each band of colours, see `contour_bands`."""
     levels = np.nan_to_num(frame.values / top * N_BANDS if top > 0 else 0 * frame.values)
     return contour_bands(np.nan_to_num(frame.points), surface.triangles, levels, N_BANDS)
+
+
+class ColourScale:
+    """Colour scale from 0 to a rounded maximum that changes only with large changes of the values.
+
+    Attributes:
+        top: Upper end; 0 before the first values.
+    """
+
+    def __init__(self) -> None:
+        """Start without an upper end."""
+        self.top = 0.0
+
+    def update(self, values: Floats) -> float:
+        """Return the upper end for values; values that are not finite are ignored."""
+        finite = values[np.isfinite(values)]
+        largest = float(finite.max()) if len(finite) else 0.0
+        if largest > self.top or largest < 0.4 * self.top:
+            self.top = round_up(largest)
+        return self.top
+
+
+def round_up(number: float) -> float:
+    """Return the smallest number {1, 1.5, 2, 3, 4, 5, 6, 8} x 10^k that is not smaller."""
+    if not 0 < number < math.inf:
+        return 0.0
+    power = 10.0 ** math.floor(math.log10(number))
+    steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+    return power * next((step for step in steps if number <= step * power * (1 + 1e-9)), 10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,22 +96,15 @@ class Renderer:
         cls, surface: Surface, frames: Sequence[Frame], size: tuple[int, int] = (960, 540)
     ) -> "Renderer":
         """Return a renderer whose camera shows the body at rest and in all frames, with arrows."""
-        symbols = SupportSymbols.of(surface).vertices(surface.undeformed)
-        arrows = (arrow_ends(surface, frame) for frame in frames)
         points = np.concatenate([
             surface.undeformed,
-            symbols,
+            surface.supports.vertices(surface.undeformed),
             *(np.nan_to_num(frame.points) for frame in frames[:: len(frames) // MAX_FITTED + 1]),
-            *(ends for ends in arrows if ends is not None),
+            *(arrow_ends(surface, frame) for frame in frames),
         ])  # fmt: skip
-        planar, aspect = surface.problem.shape[1] == 2, size[0] / size[1]
-        camera = Camera.fit(points, planar=planar, aspect=aspect, insets=INSETS)
+        aspect = size[0] / size[1]
+        camera = Camera.fit(points, planar=surface.planar, aspect=aspect, margins=MARGINS)
         return cls(surface, camera, size)
-
-    @cached_property
-    def supports(self) -> SupportSymbols:
-        """Symbols of the supports."""
-        return SupportSymbols.of(self.surface)
 
     def render(self, frame: Frame, top: float, captions: Sequence[str]) -> Image.Image:
         """Return the image of a frame with the arrow of its load, a legend and lines of text.
@@ -97,9 +118,8 @@ class Renderer:
         ax = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
         ax.set_axis_off()
         ax.add_collection(self._polygons(frame, top))
-        arrow = self._arrow(frame)
-        if arrow is not None:
-            ax.add_patch(arrow)
+        if len(ends := arrow_ends(self.surface, frame)):
+            ax.add_patch(self._arrow(ends))
         _draw_captions(figure, captions)
         if top > 0:
             _draw_legend(figure, frame.quantity, top)
@@ -113,7 +133,7 @@ class Renderer:
         soup = np.concatenate(bands)
         counts = [len(band) // 3 for band in bands]
         colours = np.repeat(band_colours(frame.quantity, top), counts, axis=0)
-        symbols = self.supports.vertices(points)[self.supports.triangles].reshape(-1, 3)
+        symbols = surface.supports.vertices(points)[surface.supports.triangles].reshape(-1, 3)
         edges = points[surface.feature_edges]
         sides = vertex_normals(points, surface.triangles)[surface.feature_edges].mean(axis=1)
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
@@ -148,11 +168,8 @@ class Renderer:
         shades = np.clip(colours * brightness[:, None], 0, 255) / 255
         return soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1)
 
-    def _arrow(self, frame: Frame) -> FancyArrowPatch | None:
-        """Return the arrow of the load, in front of the body; None without a total force."""
-        ends = arrow_ends(self.surface, frame)
-        if ends is None:
-            return None
+    def _arrow(self, ends: Floats) -> FancyArrowPatch:
+        """Return the arrow of the load, in front of the body."""
         start, end = self.camera.project(ends, *self.size)[:, :2]
         return FancyArrowPatch(
             tuple(start),
@@ -171,16 +188,10 @@ class Renderer:
 def _draw_captions(figure: Figure, captions: Sequence[str]) -> None:
     """Draw the first caption as a title in the upper left corner, and the others below it."""
     width, height = figure.get_size_inches()
-    title, others = captions[:1], captions[1:]
-    below = 0.18  # [inch]
-    for size, colour, weight, texts in (
-        (25, TEXT, "bold", title),
-        (17, TEXT_GREY, "normal", others),
-    ):
-        place = 0.22 / width, 1 - below / height
-        line = " · ".join(texts)
-        figure.text(*place, line, color=colour, size=0.72 * size, weight=weight, va="top")
-        below += 0.016 * size
+    title, others = " · ".join(captions[:1]), " · ".join(captions[1:])
+    x, below = 0.22 / width, (0.18, 0.58)  # [inch]
+    figure.text(x, 1 - below[0] / height, title, color=TEXT, size=18, weight="bold", va="top")
+    figure.text(x, 1 - below[1] / height, others, color=TEXT_GREY, size=12.24, va="top")
 
 
 def _draw_legend(figure: Figure, quantity: str, top: float) -> None:
@@ -188,11 +199,10 @@ def _draw_legend(figure: Figure, quantity: str, top: float) -> None:
     width, height = figure.get_size_inches()
     bar = figure.add_axes((1 - 0.92 / width, 0.6 / height, 0.18 / width, 1 - 1.8 / height))
     bar.imshow(band_colours(quantity)[::-1, None], aspect="auto", extent=(0, 1, 0, N_BANDS))
-    ticks = range(0, N_BANDS + 1, 3)
-    unit = unit_of_scale(top, QUANTITIES[quantity])
-    labels = [scaled(top * k / N_BANDS, unit.factor) for k in ticks]
+    unit, _, labels = tick_labels(top, QUANTITIES[quantity])
+    ticks = np.linspace(0, N_BANDS, len(labels))
     bar.set(xticks=[], yticks=ticks, yticklabels=labels, frame_on=False)
     bar.yaxis.tick_right()
     bar.tick_params(length=0, labelsize=10, labelcolor=TEXT_GREY)
-    title, place = f"{quantity} [{unit.name}]", (1 - 0.22 / width, 1 - 0.98 / height)
-    figure.text(*place, title, color=TEXT, size=10, ha="right", va="center")
+    place = 1 - 0.22 / width, 1 - 0.98 / height
+    figure.text(*place, f"{quantity} [{unit}]", color=TEXT, size=10, ha="right", va="center")

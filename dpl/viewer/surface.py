@@ -1,4 +1,4 @@
-"""Surface of a body and its division into colour bands."""
+"""Surface of a body, its division into colour bands, and symbols of its supports."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,6 +15,8 @@ from dpl.fem.postprocess import triangles as triangulate
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+THICKNESS = 0.03  # of slabs over L [-]
+PYRAMID = 0.035, 0.014  # height and half width of pyramids over L [-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,16 @@ class Surface:
     def undeformed(self) -> Floats:
         """Undeformed positions of the nodes over L, (S, 3) [-]."""
         return _to_3d(self.problem.points.numpy())[self.nodes]
+
+    @cached_property
+    def supports(self) -> "SupportSymbols":
+        """Symbols of the supports."""
+        return SupportSymbols.of(self)
+
+    @cached_property
+    def planar(self) -> bool:
+        """True for a body in 2D."""
+        return self.problem.shape[1] == 2
 
     @cached_property
     def _patches(self) -> tuple[Problem, Recovery]:
@@ -141,6 +153,26 @@ def _interpolate(p: Floats, q: Floats, v: Floats, w: Floats, level: Floats) -> F
     return p + np.clip(share, 0.0, 1.0)[:, None] * (q - p)
 
 
+def exit_distance(points: Floats, triangles: Ints, origin: Floats, direction: Floats) -> float:
+    """Return the distance at which a ray first leaves a surface; 0 if it does not.
+
+    Möller, Trumbore (1997), Fast, minimum storage ray-triangle intersection.
+    """
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    first, last = b - a, c - a
+    normal = np.cross(first, last)
+    slope = normal @ direction
+    scale = np.where(slope > 1e-12, slope, np.inf)  # only triangles that the ray leaves through
+    distance = ((a - origin) * normal).sum(axis=1) / scale
+    hit = origin + distance[:, None] * direction - a
+    across = np.linalg.norm(normal, axis=1) ** 2
+    u = (np.cross(hit, last) * normal).sum(axis=1) / np.maximum(across, 1e-300)
+    v = (np.cross(first, hit) * normal).sum(axis=1) / np.maximum(across, 1e-300)
+    inside = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (slope > 1e-12)
+    found = distance[inside & (distance > 0)]
+    return float(found.min()) if len(found) else 0.0
+
+
 def vertex_normals(points: Floats, triangles: Ints) -> Floats:
     """Return the normalised sums of the triangle normals at each point, (S, 3)."""
     normals = triangle_normals(points, triangles)
@@ -157,3 +189,103 @@ def _normalise(vectors: Floats) -> Floats:
 def _to_3d(vectors: Floats) -> Floats:
     """Return vectors (n, D) padded with zeros to (n, 3)."""
     return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
+
+
+@dataclass(frozen=True, eq=False)
+class SupportSymbols:
+    """Mesh of the symbols of supports, whose vertices follow nodes of the surface.
+
+    A slab lies behind fixed facets, a pyramid at each other fixed node. A node is fixed if at least
+    one component of its displacement is prescribed.
+
+    Attributes:
+        nodes: Node of the surface that each vertex follows, (V,).
+        offsets: Distance of each vertex from its node over L, (V, 3) [-].
+        triangles: Indices of vertices, (T, 3).
+        moves: True if a fixed node can move, on a sliding or moved support.
+    """
+
+    nodes: Ints
+    offsets: Floats
+    triangles: Ints
+    moves: bool
+
+    @classmethod
+    def of(cls, surface: Surface) -> "SupportSymbols":
+        """Return the symbols of a body; there are none if no node of the surface is fixed."""
+        problem = surface.problem
+        fixed = ~problem.free[torch.from_numpy(surface.nodes)]
+        is_fixed = fixed.any(dim=1).numpy()
+        moves = bool((fixed.any(dim=1) & ~fixed.all(dim=1)).any() or problem.prescribed.any())
+        slabs = _strips(surface, is_fixed) if surface.planar else _slabs(surface, is_fixed)
+        single = is_fixed.copy()
+        single[slabs[0]] = False
+        pyramids = _pyramids(surface, np.flatnonzero(single))
+        nodes, offsets = (np.concatenate([slabs[k], pyramids[k]]) for k in (0, 1))
+        triangles = np.concatenate([slabs[2], pyramids[2] + len(slabs[0])])
+        return cls(nodes, offsets, triangles, moves)
+
+    def vertices(self, points: Floats) -> Floats:
+        """Return the vertices (V, 3) at positions (S, 3) of the surface."""
+        return np.asarray(points[self.nodes] + self.offsets)
+
+
+def _slabs(surface: Surface, is_fixed: NDArray[np.bool_]) -> tuple[Ints, Floats, Ints]:
+    """Return nodes, offsets and triangles of slabs on the triangles whose corners are fixed."""
+    triangles = surface.triangles[is_fixed[surface.triangles].all(axis=1)]
+    normals = vertex_normals(surface.undeformed, triangles)
+    return _extrude(triangles, _rim(triangles), THICKNESS * normals)
+
+
+def _strips(surface: Surface, is_fixed: NDArray[np.bool_]) -> tuple[Ints, Floats, Ints]:
+    """Return nodes, offsets and triangles of strips along the fixed boundary of a body in 2D."""
+    sides = _rim(surface.triangles)
+    sides = sides[is_fixed[sides].all(axis=1)]
+    first, last = surface.undeformed[sides.T]
+    total = np.zeros_like(surface.undeformed)
+    for k in (0, 1):
+        np.add.at(total, sides[:, k], np.cross(last - first, (0.0, 0.0, 1.0)))
+    return _extrude(np.zeros((0, 3), dtype=int), sides, THICKNESS * _normalise(total))
+
+
+def _rim(triangles: Ints) -> Ints:
+    """Return the sides (K, 2) that belong to one triangle only, in its orientation."""
+    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, index, count = np.unique(
+        np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return np.asarray(sides[count[index.ravel()] == 1])
+
+
+def _extrude(triangles: Ints, sides: Ints, offsets: Floats) -> tuple[Ints, Floats, Ints]:
+    """Return nodes, offsets and triangles of shifted triangles and of the walls below `sides`."""
+    used = np.unique(np.concatenate([triangles.ravel(), sides.ravel()]))
+    number = np.zeros(len(offsets), dtype=int)
+    number[used] = np.arange(len(used))
+    a, b = number[sides].T
+    c, d = a + len(used), b + len(used)
+    walls = np.concatenate([np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)])
+    shifts = np.concatenate([np.zeros((len(used), 3)), offsets[used]])
+    outer = number[triangles] + len(used)
+    return np.tile(used, 2), shifts, np.concatenate([outer, walls])
+
+
+def _pyramids(surface: Surface, single: Ints) -> tuple[Ints, Floats, Ints]:
+    """Return nodes, offsets and triangles of pyramids with their tips at single fixed nodes."""
+    height, half = PYRAMID
+    axis = np.zeros((len(single), 3))
+    if surface.planar:
+        axis[:, 1] = -1.0
+    else:
+        axis[:] = vertex_normals(surface.undeformed, surface.triangles)[single]
+    other = np.eye(3)[np.abs(axis).argmin(axis=1)]
+    first = _normalise(np.cross(axis, other))
+    second = np.cross(axis, first)
+    base = [
+        height * axis + half * (i * first + j * second)
+        for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    ]
+    offsets = np.stack([0 * axis, *base], axis=1).reshape(-1, 3)
+    faces = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 3, 4]])
+    triangles = (5 * np.arange(len(single))[:, None, None] + faces).reshape(-1, 3)
+    return np.repeat(single, 5), offsets, triangles

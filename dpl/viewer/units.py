@@ -1,49 +1,41 @@
 """Numbers in engineering notation: SI prefixes in steps of a thousand."""
 
 import math
-from typing import NamedTuple
 
 PREFIXES = {-4: "p", -3: "n", -2: "µ", -1: "m", 0: "", 1: "k", 2: "M", 3: "G", 4: "T"}
 
 
-class Unit(NamedTuple):
-    """A unit with a prefix.
+def unit_for(value: float, unit: str) -> tuple[str, float]:
+    """Return a unit with prefix, such as "kPa", and its size, such as 1000 [-].
 
-    Attributes:
-        name: Name with the prefix, such as "kPa".
-        factor: Size over the unit without prefix, such as 1000 [-].
-    """
-
-    name: str
-    factor: float
-
-
-def unit_for(value: float, unit: str) -> Unit:
-    """Return the unit in which a value lies between 1 and 1000, rounded to three digits.
-
-    Zero and values that are not finite keep the unit without prefix. `unit` has no prefix.
+    In this unit the value lies between 1 and 1000, rounded to three digits. Zero and values that
+    are not finite keep the unit without prefix.
     """
     if not 0 < abs(value) < math.inf:
-        return Unit(unit, 1.0)
+        return unit, 1.0
     exponent = math.floor(math.log10(abs(float(f"{value:.2e}"))) / 3 + 1e-9)
     exponent = min(max(exponent, min(PREFIXES)), max(PREFIXES))
-    return Unit(PREFIXES[exponent] + unit, 1000.0**exponent)
+    return PREFIXES[exponent] + unit, 1000.0**exponent
 
 
-def unit_of_scale(top: float, unit: str) -> Unit:
-    """Return the unit for a scale from 0 to `top`, in which values below `top` lie above 1."""
-    return unit_for(0.99 * top, unit)
+def tick_labels(top: float, unit: str, count: int = 4) -> tuple[str, float, list[str]]:
+    """Return unit with prefix, its size [-] and numbers of a scale from 0 to `top`, `count` + 1.
+
+    The unit is that of the values below `top`, which lie above 1.
+    """
+    name, size = unit_for(0.99 * top, unit)
+    return name, size, [scaled(top * k / count, size) for k in range(count + 1)]
 
 
 def engineering(value: float, unit: str) -> str:
     """Return a value with three digits and its unit, such as "1.25 kN" for 1250 and "N"."""
-    name, factor = unit_for(value, unit)
-    return f"{scaled(value, factor)} {name}"
+    name, size = unit_for(value, unit)
+    return f"{scaled(value, size)} {name}"
 
 
-def scaled(value: float, factor: float) -> str:
-    """Return a value over a factor with three digits; whole numbers have no exponent."""
-    number = float(f"{value / factor:.2e}")
+def scaled(value: float, size: float) -> str:
+    """Return a value over the size of a unit with three digits; whole numbers have no exponent."""
+    number = float(f"{value / size:.2e}")
     return f"{number:.0f}" if 100 <= abs(number) < 1e4 else f"{number:.3g}"
 
 

@@ -7,9 +7,8 @@ from collections import deque
 from collections.abc import Callable
 
 from dpl.viewer.frames import Body, Frame, ViewSettings
-from dpl.viewer.requests import ViewRequest, distance, interpolate, scale_of
+from dpl.viewer.requests import MakeRequest, ViewRequest, distance, interpolate, scale_of
 
-MakeRequest = Callable[[], ViewRequest]
 ARRIVED = 1e-3  # relative distance below which the next frame is the requested one
 
 

@@ -246,6 +246,7 @@ def test_a_policy_has_no_allowed_hosts_and_a_random_token_by_default():
         policies = [AccessPolicy(bound, "127.0.0.1") for _ in range(2)]
     assert [policy.allowed_hosts for policy in policies] == [(), ()]
     assert policies[0].token != policies[1].token
+    assert policies[0].token not in repr(policies[0])
     assert all(len(policy.token) == 32 for policy in policies)  # 24 bytes in base 64
 
 

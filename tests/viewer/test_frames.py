@@ -6,7 +6,8 @@ import torch
 
 from dpl.fem import NeoHookeanLn, fields, rectangle
 from dpl.viewer import Body
-from dpl.viewer.frames import ERROR, STRESS, ColourScale, ViewSettings, round_up
+from dpl.viewer.frames import ERROR, STRESS, ViewSettings
+from dpl.viewer.renderer import ColourScale, round_up
 from dpl.viewer.surface import Surface, contour_bands
 
 
@@ -25,7 +26,7 @@ def patch_load(body):
     """A load on the tip and its frame."""
     node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
     target = torch.tensor([0.0, 0.0, 0.2]).double()
-    return node, body.request(body.patch(node, 0.4).force_towards(target), None)
+    return node, body.request(body.patch(node, 0.4).force_towards(target))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +151,7 @@ def test_a_uniform_force_is_out_of_distribution(body, patch_load):
     force = patch.force_along(torch.tensor([0.0, 0.0, 1.0]).double(), 0.5)
     acting = force[patch.node_mask & body.scene.loads.loadable_dofs.any(dim=1)]
     assert torch.allclose(acting, acting[:1].expand_as(acting))
-    assert body.solve(body.request(force, None), ViewSettings()).answer.out_of_distribution
+    assert body.solve(body.request(force), ViewSettings()).answer.out_of_distribution
 
 
 def test_values_are_those_of_the_quantity(body, patch_load):
@@ -201,15 +202,6 @@ def test_random_loads_are_the_trainings(body):
     assert not torch.equal(body.sample(0).force, body.sample(1).force)
 
 
-def test_invalid_requests_raise_an_error(body):
-    with pytest.raises(ValueError, match="young = 1 must lie between"):
-        body.zero_load(young=1.0)
-    with pytest.raises(ValueError, match="quantity = 'heat'"):
-        ViewSettings(quantity="heat")
-    with pytest.raises(ValueError, match="tol = nan"):
-        ViewSettings(tol=float("nan"))
-
-
 def test_ranges_of_moduli_are_those_of_the_scene(make_scene, make_body):
     body = make_body(make_scene(young=[1e6, 3e6]))
     assert body.young_range == (1e6, 3e6)
@@ -223,19 +215,18 @@ def test_poissons_ratio_changes_the_solution(make_scene, make_body):
     body: Body = make_body(scene)
     node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
     force = body.patch(node, 0.4).force_towards(torch.tensor([0.0, 0.0, 0.1]).double())
-    values = [
-        body.solve(
-            body.request(force, None, {"poisson": nu}), ViewSettings(quantity=STRESS, tol=1e-8)
-        ).values.max()
-        for nu in (0.2, 0.4)
-    ]
+
+    def with_ratio(nu):
+        return body.with_moduli(body.request(force), body.young, {"poisson": nu})
+
+    settings = ViewSettings(quantity=STRESS, tol=1e-8)
+    values = [body.solve(with_ratio(nu), settings).values.max() for nu in (0.2, 0.4)]
     assert values[0] != pytest.approx(values[1], rel=1e-3)
     with pytest.raises(ValueError, match=r"poisson = 0.45 must lie between"):
-        body.request(force, None, {"poisson": 0.45})
-    request = body.request(force, None, {"poisson": 0.25})
-    assert list(body.newton_frames(request, ViewSettings(), body.solve(request, ViewSettings())))[
-        -1
-    ].converged
+        with_ratio(0.45)
+    request = with_ratio(0.25)
+    *_, last = body.newton_frames(request, ViewSettings(), body.solve(request, ViewSettings()))
+    assert last.converged
 
 
 def test_a_body_in_2d_is_solved_and_shown(make_scene, make_body):
@@ -243,7 +234,7 @@ def test_a_body_in_2d_is_solved_and_shown(make_scene, make_body):
     body = make_body(make_scene(mesh=mesh, law=NeoHookeanLn))
     node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
     force = body.patch(node, 0.4).force_towards(torch.tensor([0.0, 0.1]).double())
-    frame = body.solve(body.request(force, None), ViewSettings(quantity=STRESS, tol=1e-6))
+    frame = body.solve(body.request(force), ViewSettings(quantity=STRESS, tol=1e-6))
     assert frame.points.shape == (36, 3)
     assert not frame.points[:, 2].any()
     assert frame.values.shape == (36,)

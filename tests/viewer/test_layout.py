@@ -7,12 +7,9 @@ import pytest
 import torch
 
 from dpl.fem import rectangle
-from dpl.viewer.camera import Camera
-from dpl.viewer.frames import ViewSettings
-from dpl.viewer.layout import Layout, label_position, largest_loads
-from dpl.viewer.load_arrow import arrow_ends, exit_distance
-from dpl.viewer.supports import THICKNESS, SupportSymbols
-from dpl.viewer.surface import Surface
+from dpl.viewer.camera import Camera, Placement, label_position, largest_loads
+from dpl.viewer.frames import ViewSettings, arrow_ends
+from dpl.viewer.surface import THICKNESS, Surface, exit_distance
 
 RADIUS = 0.4
 PLATE = rectangle([100.0, 25.0], [9, 4])
@@ -23,9 +20,12 @@ def tip(body):
 
 
 @pytest.fixture(scope="module", params=["3D", "2D"])
-def any_body(request, body, make_scene, make_body):
-    """The tiny beam and a plate."""
-    return body if request.param == "3D" else make_body(make_scene(mesh=PLATE))
+def placed(request, body, make_scene, make_body):
+    """The tiny beam or a plate, its places, and its shapes at rest and under the largest loads."""
+    body = body if request.param == "3D" else make_body(make_scene(mesh=PLATE))
+    frames = largest_loads(body, tip(body), RADIUS)
+    shapes = [body.surface.undeformed, *(frame.points for frame in frames)]
+    return body, Placement.of(body, tip(body), RADIUS), shapes
 
 
 def box_in_image(camera, points, aspect):
@@ -40,60 +40,54 @@ def box_in_image(camera, points, aspect):
 @pytest.mark.parametrize("planar", [False, True])
 def test_a_fitted_camera_shows_all_points_and_is_as_near_as_possible(aspect, planar):
     points = np.random.default_rng(0).random((50, 3)) * (1.0, 0.3, 0.0 if planar else 0.5)
-    insets = (0.02, 0.12, 0.04, 0.2)
-    camera = Camera.fit(points, planar=planar, aspect=aspect, insets=insets)
+    margins = (0.02, 0.12, 0.04, 0.2)
+    camera = Camera.fit(points, planar=planar, aspect=aspect, margins=margins)
     low, high = box_in_image(camera, points, aspect)
-    margins = np.array([low[0], 1 - high[0], 1 - high[1], low[1]]) - insets
-    assert margins.min() >= -1e-3
-    pairs = margins.reshape(2, 2)
+    empty = np.array([low[0], 1 - high[0], 1 - high[1], low[1]]) - margins
+    assert empty.min() >= -1e-3
+    pairs = empty.reshape(2, 2)
     assert np.abs(pairs).max(axis=1).min() < 1e-3, "one direction has no further space"
 
 
-@pytest.mark.parametrize("aspect", [0.7, 1.2, 2.0])
 @pytest.mark.parametrize("both", [False, True])
-def test_the_camera_shows_rest_and_largest_loads_of_one_or_two_bodies(any_body, aspect, both):
-    layout = Layout.of(any_body, tip(any_body), RADIUS)
-    camera = layout.camera(aspect=aspect, both=both)
-    shapes = [any_body.surface.undeformed]
-    shapes += [frame.points for frame in largest_loads(any_body, tip(any_body), RADIUS)]
-    dim = any_body.scene.problem.shape[1]
+def test_the_camera_shows_rest_and_largest_loads_of_one_or_two_bodies(placed, both):
+    body, placement, shapes = placed
+    dim = body.scene.problem.shape[1]
     assert len(shapes) == 1 + 2 * dim + 2**dim
     assert max(np.abs(shape - shapes[0]).max() for shape in shapes) > 0.1, "loads are large"
-    for shape in shapes:
-        for offset in [np.zeros(3), layout.offset] if both else [np.zeros(3)]:
-            low, high = box_in_image(camera, shape + offset, aspect)
+    points = np.concatenate(shapes)
+    for aspect in (0.7, 1.2, 2.0):
+        camera = placement.camera(aspect=aspect, both=both)
+        for offset in [np.zeros(3), placement.offset] if both else [np.zeros(3)]:
+            low, high = box_in_image(camera, points + offset, aspect)
             assert low.min() > 0
             assert high.max() < 1
 
 
-def test_two_bodies_do_not_overlap_in_the_image(any_body):
-    layout = Layout.of(any_body, tip(any_body), RADIUS)
-    camera = layout.camera(both=True)
-    for frame in largest_loads(any_body, tip(any_body), RADIUS):
-        first = box_in_image(camera, frame.points, 1.2)
-        second = box_in_image(camera, frame.points + layout.offset, 1.2)
+def test_two_bodies_do_not_overlap_in_the_image(placed):
+    _, placement, shapes = placed
+    camera = placement.camera(both=True)
+    for shape in shapes:
+        first = box_in_image(camera, shape, 1.2)
+        second = box_in_image(camera, shape + placement.offset, 1.2)
         gaps = np.maximum(second[0] - first[1], first[0] - second[1])
         assert gaps.max() > 0
 
 
-def test_the_camera_also_shows_what_lies_beyond_the_largest_loads(any_body):
-    layout = Layout.of(any_body, tip(any_body), RADIUS)
-    far = any_body.surface.undeformed + np.array([1.5, 0.0, 0.0])
-    low, high = box_in_image(layout.camera(shown=far), far, 1.2)
+def test_the_camera_also_shows_what_lies_beyond_the_largest_loads(placed):
+    _, placement, shapes = placed
+    far = shapes[0] + np.array([1.5, 0.0, 0.0])
+    low, high = box_in_image(placement.camera(shown=far), far, 1.2)
     assert low.min() > 0
     assert high.max() < 1
 
 
-def test_predictions_that_are_not_finite_do_not_move_the_camera(any_body):
-    surrogate = any_body.simulator.surrogate
-    good = surrogate.predict
-    try:
-        surrogate.predict = lambda load: torch.full_like(load.force, torch.nan)
-        layout = Layout.of(any_body, tip(any_body), RADIUS)
-    finally:
-        surrogate.predict = good
-    assert np.isfinite(layout.points).all()
-    assert np.isfinite(layout.camera().position).all()
+def test_predictions_that_are_not_finite_do_not_move_the_camera(body, monkeypatch):
+    wrong = body.simulator.surrogate
+    monkeypatch.setattr(wrong, "predict", lambda load: torch.full_like(load.force, torch.nan))
+    placement = Placement.of(body, tip(body), RADIUS)
+    assert np.isfinite(placement.points).all()
+    assert np.isfinite(placement.camera().position).all()
 
 
 def test_a_label_lies_above_all_that_is_shown(body):
@@ -121,12 +115,12 @@ def test_an_arrow_starts_on_the_surface_and_points_along_the_force(body):
 
 
 def test_there_is_no_arrow_without_a_total_force(body):
-    assert arrow_ends(body.surface, body.solve(body.zero_load(), ViewSettings())) is None
+    assert not len(arrow_ends(body.surface, body.solve(body.zero_load(), ViewSettings())))
     frame = body.solve(body.zero_load(), ViewSettings())
     force = torch.zeros_like(frame.request.force)
     force[-1, 2], force[-2, 2] = 1.0, -1.0
     balanced = frame._replace(load=frame.load._replace(force=force))
-    assert arrow_ends(body.surface, balanced) is None
+    assert not len(arrow_ends(body.surface, balanced))
 
 
 def test_a_ray_leaves_a_box_at_its_side(body):
@@ -147,7 +141,7 @@ def test_a_ray_leaves_a_box_at_its_side(body):
 )
 def test_supports_are_a_slab_behind_the_fixed_face(make_scene, more):
     surface = Surface.of(make_scene(**more).problem)
-    symbols = SupportSymbols.of(surface)
+    symbols = surface.supports
     assert not symbols.moves
     vertices = symbols.vertices(surface.undeformed)
     assert set(vertices[:, 0].round(9)) == {0.0, -THICKNESS}
@@ -160,7 +154,7 @@ def test_supports_are_a_slab_behind_the_fixed_face(make_scene, more):
 
 def test_supports_in_the_plane_are_a_strip_outside_of_the_body(make_scene):
     surface = Surface.of(make_scene(mesh=PLATE).problem)
-    symbols = SupportSymbols.of(surface)
+    symbols = surface.supports
     vertices = symbols.vertices(surface.undeformed)
     assert vertices[:, 0].min() == pytest.approx(-THICKNESS)
     assert vertices[:, 0].max() == pytest.approx(0)
@@ -177,7 +171,7 @@ def test_a_single_fixed_node_has_a_pyramid_with_its_tip_at_the_node(make_scene):
     free[:] = True
     free[corner, 2] = False
     surface = Surface.of(replace(problem, free=free))
-    symbols = SupportSymbols.of(surface)
+    symbols = surface.supports
     assert symbols.moves, "the node slides in two directions"
     vertices = symbols.vertices(surface.undeformed)
     assert len(vertices) == 5

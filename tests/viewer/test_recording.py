@@ -8,9 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from dpl.viewer.animation import animate_load
 from dpl.viewer.frames import ViewSettings
-from dpl.viewer.recording import FRAME_RATE, MAX_FRAMES, Recording, resample
+from dpl.viewer.recording import FRAME_RATE, MAX_FRAMES, Recording, animate_load, resample
 from dpl.viewer.renderer import Renderer
 
 

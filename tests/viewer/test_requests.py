@@ -1,14 +1,14 @@
 """Requests of loads and grasps: interpolation, answers and the load on the body."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from dpl.viewer.frames import ERROR, ViewSettings
+from dpl.viewer.frames import ERROR, ViewSettings, arrow_ends
 from dpl.viewer.hands import GraspingHand
-from dpl.viewer.load_arrow import arrow_ends
 from dpl.viewer.requests import GRASP_LIMIT_MS, distance, interpolate, scale_of
 
 EXACT = ViewSettings(tol=1e-8)
@@ -35,7 +35,7 @@ def test_interpolated_loads_start_and_end_at_the_given_loads(body):
 
 def test_interpolated_grasps_have_interpolated_motions_and_moduli(body, grasp):
     young = 2 * body.young
-    goal = body.grasp(grasp.nodes, 3 * UP, -TURN, young)
+    goal = body.with_moduli(body.grasp(grasp.nodes, 3 * UP, -TURN), young)
     assert interpolate(grasp, goal, 1.0) is goal
     middle = interpolate(grasp, goal, 0.25)
     assert torch.allclose(middle.translation, 1.5 * UP)
@@ -47,20 +47,23 @@ def test_interpolated_grasps_have_interpolated_motions_and_moduli(body, grasp):
 def test_a_request_continues_only_another_one_of_the_same_patch_and_kind(body, grasp):
     other = body.grasp(tip_patch(body, 0.1).held_nodes, UP, TURN)
     assert not torch.equal(other.nodes, grasp.nodes)
-    assert grasp.continues(grasp.at(0 * grasp.coordinates, grasp.young))
+    assert grasp.continues(grasp.at(0 * grasp.coordinates))
     assert not grasp.continues(other)
     assert not grasp.continues(body.sample(1))
     assert not body.sample(1).continues(grasp)
     assert body.sample(1).continues(body.zero_load())
+    sliding = grasp._replace(sliding=True)
+    assert sliding.continues(sliding.at(sliding.coordinates))
+    assert not sliding.continues(grasp)
 
 
 def test_the_distance_of_grasps_is_relative_to_the_larger_motion(body, grasp):
-    rest = grasp.at(0 * grasp.coordinates, grasp.young)
+    rest = grasp.at(0 * grasp.coordinates)
     scale = scale_of(rest, grasp)
     assert scale == pytest.approx(float(torch.cat([UP, TURN]).norm()))
     assert distance(rest, grasp, scale) == pytest.approx(1)
     assert distance(interpolate(rest, grasp, 0.75), grasp, scale) == pytest.approx(0.25)
-    softer = grasp.at(grasp.coordinates, 0.5 * grasp.young)
+    softer = grasp.with_moduli(0.5 * grasp.young, grasp.parameters)
     assert distance(softer, grasp, scale) == pytest.approx(0.5)
     assert scale_of(rest, rest) == 1.0
 
@@ -87,7 +90,7 @@ def test_the_load_of_a_grasp_has_its_displacement(make_scene, make_body):
     weight[:, 1] = -2e-7
     body = make_body(make_scene(constant_force=weight))
     young = 2 * body.young
-    request = body.grasp(tip_patch(body).held_nodes, UP, TURN, young)
+    request = body.with_moduli(body.grasp(tip_patch(body).held_nodes, UP, TURN), young)
     frame = body.solve(request, EXACT)
     assert frame.converged
     gripper = torch.from_numpy(frame.grasp.nodal_force)
@@ -132,28 +135,36 @@ def test_the_arrow_of_a_grasp_has_the_direction_of_the_grippers_force(body, gras
     start, end = arrow_ends(body.surface, frame)
     direction = (end - start) / np.linalg.norm(end - start)
     assert direction == pytest.approx(frame.grasp.force / np.linalg.norm(frame.grasp.force))
-    rest = body.solve(grasp.at(0 * grasp.coordinates, grasp.young), ViewSettings())
-    assert arrow_ends(body.surface, rest) is None
+    rest = body.solve(grasp.at(0 * grasp.coordinates), ViewSettings())
+    assert not len(arrow_ends(body.surface, rest))
 
 
-def test_a_patch_without_free_nodes_is_refused(body):
-    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmin()])
-    with pytest.raises(ValueError, match="the patch has no free node of the boundary"):
-        body.grasp(body.patch(node, 0.01).held_nodes, UP, TURN)
+def fixed_patch(body):
+    return body.patch(int(body.surface.nodes[body.surface.undeformed[:, 0].argmin()]), 0.01)
 
 
-def test_values_out_of_range_are_refused(body, grasp):
-    with pytest.raises(ValueError, match="young = 1 must lie between"):
-        body.grasp(grasp.nodes, UP, TURN, 1.0)
-    with pytest.raises(ValueError, match="all finite"):
-        body.solve(body.grasp(grasp.nodes, float("nan") * UP, TURN), ViewSettings())
-
-
-def test_a_sliding_grasp_continues_only_another_one(body, grasp):
-    sliding = grasp._replace(sliding=True)
-    assert sliding.continues(sliding)
-    assert not sliding.continues(grasp)
-    assert sliding.at(sliding.coordinates, sliding.young).sliding
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda body: body.grasp(fixed_patch(body).held_nodes, UP, TURN), "no free node of the"),
+        (
+            lambda body: body.grasp(tip_patch(body, 0.01).sliding_nodes, UP, TURN, sliding=True),
+            "the patch has no facet across x, y or z",
+        ),
+        (
+            lambda body: body.solve(
+                body.grasp(tip_patch(body).held_nodes, math.nan * UP, TURN), ViewSettings()
+            ),
+            "all finite",
+        ),
+        (lambda body: body.with_moduli(body.zero_load(), 1.0), "young = 1 must lie between"),
+        (lambda body: ViewSettings(quantity="heat"), "quantity = 'heat'"),
+        (lambda body: ViewSettings(tol=math.nan), "tol = nan"),
+    ],
+)
+def test_invalid_values_are_refused(body, make, words):
+    with pytest.raises(ValueError, match=words):
+        make(body)
 
 
 def test_a_sliding_patch_moves_along_its_normal_alone(body):
@@ -167,12 +178,6 @@ def test_a_sliding_patch_moves_along_its_normal_alone(body):
     assert not frame.hand_force[:, 1:].any()
     *_, last = body.newton_frames(frame.request, EXACT, frame)
     assert torch.allclose(last.displacement, frame.displacement, atol=1e-6 * 8.0)
-
-
-def test_a_patch_without_a_facet_across_an_axis_cannot_slide(body):
-    nodes = body.patch(tip_patch(body).node, 0.01).sliding_nodes
-    with pytest.raises(ValueError, match="the patch has no facet across x, y or z"):
-        body.grasp(nodes, UP, TURN, sliding=True)
 
 
 def test_a_grasp_without_a_budget_has_the_limit_of_the_page(body, grasp):
@@ -210,14 +215,14 @@ def test_a_hand_takes_a_patch_where_the_body_is_shown(body):
     frame = body.solve(body.sample(1), EXACT)
     assert hand.take(patch.node, frame) == patch.node
     assert controls.angle.value == 0.0
-    request = hand.move(UP)(body.young, {})
+    request = hand.move(UP)()
     mean = frame.displacement[patch.held_nodes].mean(dim=0) / body.scene.length
     assert mean.norm() > 0.01
     assert torch.allclose(request.translation, mean + UP)
     other = int(torch.nonzero(patch.held_nodes)[0])
     assert other != patch.node
     assert hand.take(other, frame) == patch.node, "a drag within the patch keeps it"
-    again = hand.move(UP)(body.young, {})
+    again = hand.move(UP)()
     assert torch.allclose(again.translation, mean + 2 * UP)
     assert torch.equal(again.nodes, request.nodes)
     hand.release()

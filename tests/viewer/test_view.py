@@ -7,45 +7,49 @@ import socket
 import sys
 
 import pytest
+from omegaconf import OmegaConf
 from PIL import Image
 
 import dpl.viewer
+from dpl.commands import view
 from dpl.viewer.recording import FRAME_RATE
+
+pytest.importorskip("viser", reason="the extra viewer is not installed")
+ADDRESS = r"the page is at http://127\.0\.0\.1:\d+/[\w-]{32}/  \(Ctrl-C ends it\)\n"
 
 
 @pytest.fixture(scope="module")
-def home(start, tiny_training, tmp_path_factory):
-    """Working directory with a trained run."""
+def home(start, members, tiny_training, tmp_path_factory):
+    """Working directory with a trained run, whose page was served at the end of the training."""
     home = tmp_path_factory.mktemp("home")
-    process = start("train", *tiny_training, "trainer.max_epochs=1", "run=runs/a", cwd=home)
-    _, err = process.communicate(timeout=240)
-    assert process.returncode == 0, err[-2000:]
+    short = ["trainer.max_epochs=1", "extras.view=true", "run=runs/a"]
+    process = start("train", *tiny_training, *short, cwd=home)
+    lines = iter(process.stdout.readline, "")
+    assert any(re.fullmatch(ADDRESS, line) for line in lines), process.stderr.read()[-2000:]
+    os.kill(process.pid, signal.SIGINT)
+    assert process.wait(timeout=240) == 130
+    assert not members(process.pid)
     return home
 
 
 def test_the_page_prints_its_address_and_ctrl_c_ends_all_processes(start, members, home):
-    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    assert (home / "runs/a/evaluation.json").is_file(), "the page is served at the end"
     process = start("view", "run=runs/a", "port=0", cwd=home)
     line = process.stdout.readline()
-    assert re.fullmatch(
-        r"the page is at http://127\.0\.0\.1:\d+/[\w-]{32}/  \(Ctrl-C ends it\)\n", line
-    ), line + process.stderr.read()
+    assert re.fullmatch(ADDRESS, line), line + process.stderr.read()
     os.kill(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=240)
     assert (process.returncode, out, err) == (130, "", "interrupted\n")
     assert not members(process.pid)
 
 
-def test_a_training_serves_the_page_of_its_run_at_the_end(start, members, tiny_training, tmp_path):
-    pytest.importorskip("viser", reason="the extra viewer is not installed")
-    short = ["trainer.max_epochs=1", "extras.view=true", "run=runs/a"]
-    process = start("train", *tiny_training, *short, cwd=tmp_path)
-    lines = iter(process.stdout.readline, "")
-    assert any(line.startswith("the page is at http://127.0.0.1:") for line in lines)
-    os.kill(process.pid, signal.SIGINT)
-    assert process.wait(timeout=240) == 130
-    assert not members(process.pid)
-    assert (tmp_path / "runs/a/evaluation.json").is_file()
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_only_a_public_host_prints_a_warning(capsys, host):
+    policy = view.bind(OmegaConf.create({"host": host, "port": 0, "allowed_hosts": []}))
+    with policy.socket:
+        assert policy.url.startswith("http://127.0.0.1:")
+    warning = "warning: host = 0.0.0.0: everyone who reaches this machine"
+    assert capsys.readouterr().err.startswith(warning) == policy.is_public == (host == "0.0.0.0")
 
 
 def test_a_sweep_serves_no_page(script, tiny_training, tmp_path):
@@ -53,15 +57,6 @@ def test_a_sweep_serves_no_page(script, tiny_training, tmp_path):
     assert ended.status == 2
     assert "extras.view = true needs one run" in ended.err
     assert not (tmp_path / "datasets").exists()
-
-
-def test_a_public_host_prints_a_warning(start, home):
-    pytest.importorskip("viser", reason="the extra viewer is not installed")
-    process = start("view", "run=runs/a", "port=0", "host=0.0.0.0", cwd=home)
-    assert process.stdout.readline().startswith("the page is at http://127.0.0.1:")
-    os.kill(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=240)
-    assert err.startswith("warning: host = 0.0.0.0: everyone who reaches this machine")
 
 
 @pytest.mark.parametrize(
@@ -77,7 +72,6 @@ def test_a_public_host_prints_a_warning(start, home):
     ids=str,
 )
 def test_invalid_input_prints_one_line(script, home, arguments, words):
-    pytest.importorskip("viser", reason="the extra viewer is not installed")
     ended = script("view", *arguments, cwd=home)
     assert ended.status != 0
     if words:
@@ -102,7 +96,6 @@ def test_a_refused_correction_names_its_key_and_a_data_set_its_folder(script, ho
 
 
 def test_a_port_in_use_is_reported(script, home):
-    pytest.importorskip("viser", reason="the extra viewer is not installed")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -114,7 +107,7 @@ def test_a_port_in_use_is_reported(script, home):
 
 def test_without_viser_the_message_names_the_extra(script, home, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    for name in ("page", "body_node"):
+    for name in ("page", "nodes"):
         monkeypatch.delitem(sys.modules, f"dpl.viewer.{name}", raising=False)
     monkeypatch.delitem(vars(dpl.viewer), "Page", raising=False)
     ended = script("view", "run=runs/a", cwd=home)

@@ -184,7 +184,7 @@ def test_newton_iterates_are_shown_until_a_new_load_arrives(make_worker, body, s
 def test_an_error_is_reported_and_the_next_load_is_solved(make_worker, body, shown):
     messages = []
     worker = make_worker(smoothing_time=0.0, on_error=messages.append)
-    worker.submit(lambda: body.zero_load(young=1.0))
+    worker.submit(lambda: body.with_moduli(body.zero_load(), 1.0))
     assert worker.wait(LONG)
     assert messages
     assert messages[0].startswith("young = 1 must lie between")
