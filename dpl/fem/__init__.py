@@ -10,13 +10,10 @@ if TYPE_CHECKING:
     from dpl.fem.assembly.follower_pressure import FollowerPressure
     from dpl.fem.linear.backends import installed_backends
     from dpl.fem.linear.interface import SingularMatrix
-    from dpl.fem.loads.cable import CableLoads
-    from dpl.fem.loads.face_pressure import FacePressure
-    from dpl.fem.loads.face_tractions import FaceTractions
+    from dpl.fem.loads.distributed import CableLoads, FacePressure, FaceTractions, GravityLoads
     from dpl.fem.loads.family import HasModes, HasModuli, LoadFamily, RandomLoads, moduli_of
     from dpl.fem.loads.file import FileLoads
     from dpl.fem.loads.forces import BodyForce, Traction
-    from dpl.fem.loads.gravity import GravityLoads
     from dpl.fem.loads.mixture import MixtureLoads
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes

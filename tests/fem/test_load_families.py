@@ -504,7 +504,7 @@ def test_an_empty_or_fixed_region_is_refused_in_one_line(build, linear, name):
         ("patch", {"largest": 0.0}, "largest = 0.0 must be a number above 0 [Pa], or null"),
         ("patch", {"largest": math.inf}, "largest = inf must be"),
         ("patch", {"patch_radius": (0.5, 0.1)}, "patch_radius = [0.5, 0.1] must be"),
-        ("patch", {"deflection": 0.0}, "deflection = 0.0 must lie between"),
+        ("patch", {"deflection": 0.0}, "deflection = 0.0 must be a number from 1e-12 to 10 [times L]"),
         (
             "point",
             {"count": (0, 2)},

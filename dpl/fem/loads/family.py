@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.identity import identity_of
+from dpl.fem.loads.options import check_options
 from dpl.fem.loads.sampling import SAMPLINGS, Array
 from dpl.fem.loads.young import Young, YoungRange
 from dpl.fem.problem import Problem
@@ -149,7 +150,8 @@ class RandomLoads(LoadFamily):
     """Base of load families: subclasses define the force of a point of the unit cube.
 
     A subclass defines `n_force`, `force_at` and `largest_force`. It overrides `project` if it can
-    recognise its forces, and `loadable_dofs` if it loads nodes inside the body.
+    recognise its forces, and `loadable_dofs` if it loads nodes inside the body. Options that it
+    declares by `option` are checked here.
 
     Attributes:
         linear: Body, with the factor of its K(0).
@@ -166,11 +168,7 @@ class RandomLoads(LoadFamily):
     sampling: str = "independent"
 
     def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ValueError: An attribute is out of range.
-        """
+        check_options(self)
         if self.sampling not in SAMPLINGS:
             raise ValueError(f"sampling = {self.sampling!r} must be {' or '.join(SAMPLINGS)}")
         self.moduli  # noqa: B018  # raises if it is out of range
