@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dpl.export.onnx_graph import ExportGraph, onnx_opset
 from dpl.export.reference import Reference
-from dpl.fem import HasModes, Problem, moduli_of, surface
+from dpl.fem import HasModes, Problem, surface
 from dpl.fem.mesh.writing import flat_cells
 from dpl.fem.postprocess import triangles
 from dpl.models import ClosedFormFit
@@ -65,7 +65,7 @@ def describe(
             "loadable": _indices(loads.loadable_dofs),
         },
         "scales": _scales(module),
-        "material": {**_law(scene), "young": loads.young_range, **law_ranges},
+        "material": {**_law(scene), "young": loads.moduli, **law_ranges},
         "range": _range(scene),
         "errors": errors,
         "reference": reference.describe(),
@@ -84,8 +84,8 @@ def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
             "shape": ["B"],
             "type": "float64",
             "unit": "Pa",
-            "range": loads.young_range,
-            "distribution": moduli_of(loads).distribution,
+            "range": loads.moduli,
+            "distribution": "log" if loads.moduli.is_log else "uniform",
         },
         "parameters": {
             "shape": ["B", len(loads.parameter_ranges)],

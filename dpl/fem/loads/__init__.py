@@ -7,7 +7,7 @@ from dpl.system.lazy import public_names
 if TYPE_CHECKING:
     from dpl.fem.loads.combined import CombinedLoads, VectorLoads
     from dpl.fem.loads.distributed import CableLoads, FacePressure, FaceTractions, GravityLoads
-    from dpl.fem.loads.family import HasModes, HasModuli, LoadFamily, RandomLoads, moduli_of
+    from dpl.fem.loads.family import HasModes, LoadFamily, RandomLoads
     from dpl.fem.loads.file import FileLoads
     from dpl.fem.loads.forces import BodyForce, Traction, body_force, traction
     from dpl.fem.loads.mixture import MixtureLoads
@@ -26,6 +26,5 @@ if TYPE_CHECKING:
     )
     from dpl.fem.loads.sized import SizedLoads
     from dpl.fem.loads.surface import SurfaceLoads
-    from dpl.fem.loads.young import YoungRange
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)
