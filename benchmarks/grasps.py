@@ -209,7 +209,7 @@ def measure(
         "hybrid to 1e-6": (gripper, TOL),
     }
     found: dict[str, list[list[float]]] = {name: [] for name in (*options, NEWTON)}
-    unit = float(scene.loads.young_range[0]) * scene.force_unit
+    unit = float(scene.loads.moduli[0]) * scene.force_unit
     for k, grasp in enumerate(grasps):
         patch = gripper.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
         if (known := references(scene, patch, grasp)) is None:

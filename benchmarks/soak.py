@@ -108,7 +108,7 @@ def _loads(scene: Scene) -> Callable[[int], torch.Tensor]:
 def _calls(sim: Simulator) -> Iterator[Callable[[torch.Tensor], object]]:
     """Yield the kinds of calls; each gives Young's modulus."""
     loads = sim.scene.loads
-    young = float(loads.young_range[1])
+    young = float(loads.moduli[1])
     yield partial(sim, young=young)
     for tol in (1e-3, 1e-6):
         yield partial(sim, young=young, tol=tol)

@@ -16,10 +16,9 @@ from dpl.fem import (
     Load,
     LoadFamily,
     Newton,
+    ParameterRange,
     Problem,
     ReferenceSolver,
-    YoungRange,
-    moduli_of,
     solve,
 )
 from dpl.fem.identity import plain, sha256_of
@@ -94,7 +93,7 @@ class Scene:
                 loads, or a range.
         """
         if self.problem.has_one_modulus:
-            for young in self.loads.young_range:
+            for young in self.loads.moduli:
                 self.problem.check_modulus(young)
 
     @property
@@ -258,7 +257,7 @@ class Scene:
                 f"{problem.points.numel():,} degrees of freedom",
             ),
             ("supports", f"{fixed:,} nodes {moved}{springs}"),
-            ("law", f"{problem.material.describe()}, {_modulus(moduli_of(loads))}"),
+            ("law", f"{problem.material.describe()}, {_modulus(loads.moduli)}"),
             (
                 "loads",
                 f"{type(loads).__name__}; the largest of {FEW}: {force:.3g} {unit}{bends}",
@@ -281,7 +280,7 @@ class Scene:
         """Return one line for each computation that this scene does not need."""
         problem, loads = self.problem, self.loads
         cells, points = len(problem.cells), problem.dV.shape[1]
-        young = _modulus(moduli_of(loads))
+        young = _modulus(loads.moduli)
         lines = [f"no E input, no samples per E: u/L depends on f/(E L^2) only ({young})"]
         for name, ends in problem.material.parameter_ranges.items():
             lines.append(
@@ -310,13 +309,12 @@ class Scene:
         return lines + loads.skipped_work()
 
 
-def _modulus(moduli: YoungRange) -> str:
+def _modulus(moduli: ParameterRange) -> str:
     """Return Young's modulus, or its range, as text."""
-    low, high = moduli.low, moduli.high
+    low, high = moduli
     if low == high:
         return f"E = {low:.4g} Pa"
-    is_log = moduli.distribution == "log"
-    return f"E from {low:.4g} to {high:.4g} Pa{', uniform in log E' if is_log else ''}"
+    return f"E from {low:.4g} to {high:.4g} Pa{', uniform in log E' if moduli.is_log else ''}"
 
 
 def _plain(identity: Any) -> Any:

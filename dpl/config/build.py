@@ -26,7 +26,7 @@ from torch import Tensor
 from dpl import training
 from dpl.config import validation
 from dpl.config.validation import ConfigError
-from dpl.fem import Problem, SingularMatrix, YoungRange
+from dpl.fem import ParameterRange, Problem, SingularMatrix
 from dpl.fem.assembly.follower_loads import FollowerLoad
 from dpl.fem.units import Units
 from dpl.scene import Scene
@@ -167,7 +167,7 @@ def build_scene(cfg: DictConfig) -> Scene:
     young, ends = _young(cfg), moduli(cfg)
     forces = _parts(cfg, "forces")
     follower = {name: f for name, f in forces.items() if isinstance(f, FollowerLoad)}
-    problem = _problem(cfg, ends.low if ends.low == ends.high else None, follower)
+    problem = _problem(cfg, ends[0] if ends[0] == ends[1] else None, follower)
     dead = {name: force for name, force in forces.items() if name not in follower}
     always = _constant_force(dead, problem)
     solver = instantiate(cfg, "solver", problem=problem)
@@ -185,10 +185,10 @@ def _young(cfg: DictConfig) -> Any:
     return OmegaConf.to_container(cfg.young) if is_range else cfg.young
 
 
-def moduli(cfg: DictConfig) -> YoungRange:
+def moduli(cfg: DictConfig) -> ParameterRange:
     """Return the range of Young's moduli of all loads; raise a `ConfigError` if it is invalid."""
     try:
-        return YoungRange.of(_young(cfg))
+        return ParameterRange.of_young(_young(cfg))
     except ValueError as error:  # its message names the key
         raise ConfigError(str(error)) from error
 

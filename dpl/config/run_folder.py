@@ -27,7 +27,6 @@ from dpl.config.build import (
     to_container,
 )
 from dpl.config.validation import ConfigError
-from dpl.fem import moduli_of
 from dpl.fem import read_mesh as load_mesh
 from dpl.fem.mesh.generators import longest_side
 from dpl.scene import Scene
@@ -203,7 +202,7 @@ def _scene_of_run(
 
 def _reused_or_built(cfg: DictConfig, known: Scene | None) -> Scene:
     """Return a known scene if it has the size and the moduli of a configuration, else a new one."""
-    if known is None or moduli(cfg) != moduli_of(known.loads):
+    if known is None or moduli(cfg) != known.loads.moduli:
         return build_scene(cfg)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # printed when the scene was built

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dpl.export.comparison import CHECK_STREAM
 from dpl.export.onnx_graph import Array, ExportGraph, onnx_opset
-from dpl.fem import HasModes, Problem, evaluate_solution, moduli_of, solve, surface
+from dpl.fem import HasModes, Problem, evaluate_solution, solve, surface
 from dpl.fem.mesh.writing import flat_cells
 from dpl.fem.postprocess import triangles
 from dpl.models import ClosedFormFit
@@ -67,7 +67,7 @@ def describe(
             "loadable": _indices(loads.loadable_dofs),
         },
         "scales": _scales(module),
-        "material": {**_law(scene), "young": loads.young_range, **law_ranges},
+        "material": {**_law(scene), "young": loads.moduli, **law_ranges},
         "range": _range(scene),
         "errors": errors,
         "reference": reference,
@@ -86,8 +86,8 @@ def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
             "shape": ["B"],
             "type": "float64",
             "unit": "Pa",
-            "range": loads.young_range,
-            "distribution": moduli_of(loads).distribution,
+            "range": loads.moduli,
+            "distribution": "log" if loads.moduli.is_log else "uniform",
         },
         "parameters": {
             "shape": ["B", len(loads.parameter_ranges)],

@@ -10,19 +10,15 @@ if TYPE_CHECKING:
     from dpl.fem.assembly.follower_pressure import FollowerPressure
     from dpl.fem.linear.backends import installed_backends
     from dpl.fem.linear.interface import SingularMatrix
-    from dpl.fem.loads.cable import CableLoads
-    from dpl.fem.loads.face_pressure import FacePressure
-    from dpl.fem.loads.face_tractions import FaceTractions
-    from dpl.fem.loads.family import HasModes, HasModuli, LoadFamily, RandomLoads, moduli_of
+    from dpl.fem.loads.distributed import CableLoads, FacePressure, FaceTractions, GravityLoads
+    from dpl.fem.loads.family import HasModes, LoadFamily, RandomLoads
     from dpl.fem.loads.file import FileLoads
     from dpl.fem.loads.forces import BodyForce, Traction
-    from dpl.fem.loads.gravity import GravityLoads
     from dpl.fem.loads.mixture import MixtureLoads
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
     from dpl.fem.loads.patch import PatchLoads
     from dpl.fem.loads.point import PointLoads
-    from dpl.fem.loads.young import YoungRange
     from dpl.fem.materials.cell_field import CellField
     from dpl.fem.materials.demiray import DemirayK2
     from dpl.fem.materials.fibre_directions import (
@@ -62,6 +58,7 @@ if TYPE_CHECKING:
     from dpl.fem.postprocess.stress import Fields, fields
     from dpl.fem.postprocess.surface import surface
     from dpl.fem.problem import Problem
+    from dpl.fem.ranges import ParameterRange
     from dpl.fem.rom.galerkin import PODGalerkin
     from dpl.fem.rom.subspace_newton import SubspaceNewton
     from dpl.fem.solvers.anderson import AndersonSolver

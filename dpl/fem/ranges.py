@@ -7,6 +7,7 @@ from typing import Any, Self
 from torch import Tensor
 
 DISTRIBUTIONS = ("uniform", "log")
+Young = float | Sequence[float] | Mapping[str, Any]  # a number, [low, high], or options of a range
 
 
 class ParameterRange(tuple[float, float]):
@@ -24,6 +25,16 @@ class ParameterRange(tuple[float, float]):
         made.is_log = is_log
         return made
 
+    def __eq__(self, other: object) -> bool:
+        """Return True for a range, or a pair of numbers, with these ends and distribution."""
+        return tuple.__eq__(self, other) is True and self.is_log == getattr(other, "is_log", False)
+
+    def __ne__(self, other: object) -> bool:
+        """Return the opposite of ==, which a tuple defines by itself."""
+        return not self == other
+
+    __hash__ = tuple.__hash__
+
     def __getnewargs_ex__(self) -> tuple[tuple[float, ...], dict[str, bool]]:
         """Return the arguments with which a copy is made."""
         return tuple(self), {"is_log": self.is_log}
@@ -35,22 +46,31 @@ class ParameterRange(tuple[float, float]):
         Raises:
             ValueError: `value` is neither, or is out of order. The message begins with `name`.
         """
-        if isinstance(value, ParameterRange):
-            return value
-        options = dict(value) if isinstance(value, Mapping) else {}
-        ends = [options.pop("low", None), options.pop("high", None)] if options else list(value)
-        distribution = options.pop("distribution", "uniform")
-        numbers = [x for x in ends if isinstance(x, int | float) and math.isfinite(x)]
-        if options or len(numbers) != 2 or len(ends) != 2 or not numbers[0] < numbers[1]:
+        ends, distribution = _parts(name, value)
+        if len(ends) != 2 or not ends[0] < ends[1]:
             raise ValueError(
                 f"{name} = {value} must be a range [low, high], low below high, or "
                 "{low, high, distribution}"
             )
-        if distribution not in DISTRIBUTIONS:
-            raise ValueError(f"{name}.distribution = {distribution!r} must be uniform or log")
-        if distribution == "log" and not numbers[0] > 0:
+        if distribution == "log" and not ends[0] > 0:
             raise ValueError(f"{name} = {value} must be above 0 for a logarithmic distribution")
-        return cls(*numbers, is_log=distribution == "log")
+        return cls(*ends, is_log=distribution == "log")
+
+    @classmethod
+    def of_young(cls, young: Young) -> "ParameterRange":
+        """Return the range of Young's moduli [Pa]: a number, [low, high], low = high allowed, or
+        {low, high, distribution}.
+
+        Raises:
+            ValueError: `young` is none of these, or not above 0.
+        """
+        ends, distribution = _parts("young", young)
+        if len(ends) != 2 or not 0 < ends[0] <= ends[1]:
+            raise ValueError(
+                f"young = {young} must be a number, an ascending range [low, high] or "
+                "{low, high, distribution}, above 0 [Pa]"
+            )
+        return cls(*ends, is_log=distribution == "log")
 
     @property
     def middle(self) -> float:
@@ -64,11 +84,35 @@ class ParameterRange(tuple[float, float]):
         return low * (high / low) ** t if self.is_log else low + (high - low) * t
 
     def normalise(self, values: Tensor) -> Tensor:
-        """Return values mapped from the range to [-1, 1], by their logarithm if that is uniform."""
+        """Return values mapped from the range to [-1, 1], by their logarithm if that is uniform.
+
+        Without a range, the value is mapped to 0, and twice the value (or e times it, by the
+        logarithm) to 1.
+        """
         low, high = self
+        half = high
         if self.is_log:
-            low, high, values = math.log(low), math.log(high), values.log()
-        return (2 * values - (low + high)) / (high - low)
+            low, high, values, half = math.log(low), math.log(high), values.log(), 1.0
+        return (2 * values - (low + high)) / ((high - low) or 2 * half)
+
+
+def _parts(name: str, value: Any) -> tuple[list[float], str]:
+    """Return the ends of a number, [low, high] or {low, high, distribution}, and the distribution.
+
+    There are no ends if the value is none of these, or has an end that is not finite.
+
+    Raises:
+        ValueError: There is no such distribution. The message begins with `name`.
+    """
+    options = dict(value) if isinstance(value, Mapping) else {}
+    ends = [options.pop("low", None), options.pop("high", None)] if options else value
+    ends = list(ends) if isinstance(ends, Sequence) else [ends, ends]
+    usual = "log" if getattr(value, "is_log", False) else "uniform"
+    distribution = options.pop("distribution", usual)
+    if distribution not in DISTRIBUTIONS:
+        raise ValueError(f"{name}.distribution = {distribution!r} must be uniform or log")
+    numbers = [float(x) for x in ends if isinstance(x, int | float) and math.isfinite(x)]
+    return [] if options or len(numbers) != len(ends) else numbers, distribution
 
 
 def is_range(value: object) -> bool:

@@ -138,7 +138,7 @@ def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
 
 def _moduli(scene: Scene, young: Any, count: int) -> Tensor:
     """Return Young's moduli (B,) [Pa] of a call."""
-    low, high = scene.loads.young_range
+    low, high = scene.loads.moduli
     if young is None and low < high:
         raise ValueError(f"young: the scene has a range, {low:g} to {high:g} Pa; say which")
     moduli = per_load("young", low if young is None else young, count)

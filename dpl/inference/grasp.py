@@ -295,7 +295,7 @@ class Gripper:
         load = as_load(scene, rest, young, parameters)
         if (constant := scene.loads.constant_force) is None:
             return load
-        modulus = scene.loads.young_range[0]  # by which the constant force is divided
+        modulus = scene.loads.moduli[0]  # by which the constant force is divided
         return load._replace(force=constant[None] * (modulus / load.young))
 
     def _patch(

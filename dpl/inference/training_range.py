@@ -57,4 +57,4 @@ def _inputs(surrogate: Surrogate, load: Load) -> Sequence[tuple[Tensor, tuple[fl
     """Return the moduli (B,) that are inputs of the network, each with its range."""
     loads, takes = surrogate.scene.loads, getattr(surrogate.net, "extra_inputs", ())
     pairs = list(zip(load.parameters.unbind(1), loads.parameter_ranges.values(), strict=True))
-    return [*pairs, (load.young, loads.young_range)] if "young" in takes else pairs
+    return [*pairs, (load.young, loads.moduli)] if "young" in takes else pairs

@@ -5,7 +5,6 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from dpl.fem import moduli_of
 from dpl.models.linear_base import Base
 from dpl.models.scalar_inputs import ScalarInputs
 from dpl.scene import Scene
@@ -72,7 +71,7 @@ class FCNN(nn.Module):
         loaded = scene.problem.free if base == "linear" else scene.loads.loadable_dofs
         inputs = everything if all_dofs else loaded
         outputs = everything if all_dofs else scene.problem.free
-        self.moduli = moduli_of(scene.loads)
+        self.moduli = scene.loads.moduli
         self.extra_inputs = (*(("young",) if young else ()), *self.scalars.names)
         n_inputs = int(inputs.sum()) + young + self.scalars.count
         n_outputs = int(outputs.sum())
@@ -115,7 +114,7 @@ class FCNN(nn.Module):
                 raise ValueError(
                     "young is an input of this network; give Young's moduli, (B,) [Pa]"
                 )
-            stiffness = (young / self.moduli.high).to(force.dtype)[:, None]
+            stiffness = (young / self.moduli[1]).to(force.dtype)[:, None]
             normalised = self.moduli.normalise(young).to(force.dtype)[:, None]
             inputs = torch.cat([stiffness * inputs, normalised], dim=1)
         if self.scalars.count:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem import Solution, moduli_of
+from dpl.fem import Solution
 from dpl.fem.solvers import check_tol
 from dpl.inference import Answer, GraspAnswer, Simulator
 from dpl.system.threads import one_thread
@@ -111,7 +111,7 @@ class Body:
         self.simulator = simulator
         self.scene = simulator.scene
         self.surface = Surface.of(self.scene.problem)
-        self.young = moduli_of(self.scene.loads).middle
+        self.young = self.scene.loads.moduli.middle
         ranges = self.scene.loads.parameter_ranges
         self.parameters = {name: ends.middle for name, ends in ranges.items()}
         self._without_galerkin = simulator
@@ -127,7 +127,7 @@ class Body:
     @property
     def young_range(self) -> tuple[float, float]:
         """Smallest and largest Young's modulus of a request [Pa]."""
-        low, high = self.scene.loads.young_range
+        low, high = self.scene.loads.moduli
         if low < high or self.scene.problem.has_one_modulus:
             return low, high
         return low / YOUNG_FACTOR, high * YOUNG_FACTOR

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from dpl.config import ConfigError, build
 from dpl.data.solving.solve import LoadKey, solve_load
-from dpl.fem import YoungPoissonMaterial, box, solve
+from dpl.fem import ParameterRange, YoungPoissonMaterial, box, solve
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -352,8 +352,8 @@ def test_the_beam_of_a_range_of_moduli_shares_its_data_with_the_beam_of_one(scen
     """The same body in units of L and E, whatever its size and modulus."""
     beam, young = (scene_of(f"experiment={name}") for name in ("beam_nh_loss", "beam_young"))
     assert young.fingerprint == beam.fingerprint
-    assert young.loads.young_range == (1e9, 2.03e11)
-    assert beam.loads.young_range[0] == beam.loads.young_range[1]
+    assert young.loads.moduli == (1e9, 2.03e11)
+    assert beam.loads.moduli[0] == beam.loads.moduli[1]
     assert (young.length, beam.length) == pytest.approx((1.0, 100.0))
     assert beam.fingerprint.startswith("21aeaad6b7b1"), "data sets of the paper's beam are valid"
 
@@ -362,8 +362,8 @@ def test_the_distribution_of_the_moduli_is_one_key_of_the_experiments(scene_of):
     usual, wide = ["mesh.nodes=[5,3,3]"], "experiment=beam_young_wide"
     for name in ("uniform", "log"):
         moduli = scene_of(wide, f"young.distribution={name}", *usual).loads.moduli
-        assert (moduli.low, moduli.high, moduli.distribution) == (1e6, 2.03e11, name)
-    assert scene_of(wide, "young=4500", *usual).loads.young_range == (4500.0, 4500.0)
+        assert moduli == ParameterRange(1e6, 2.03e11, is_log=name == "log")
+    assert scene_of(wide, "young=4500", *usual).loads.moduli == (4500.0, 4500.0)
 
 
 @pytest.mark.parametrize(

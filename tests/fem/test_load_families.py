@@ -2,6 +2,7 @@
 
 import math
 import pickle
+import re
 from functools import partial
 from types import SimpleNamespace
 
@@ -10,34 +11,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl import Scene
-from dpl.fem import (
-    Box,
-    CableLoads,
-    FacePressure,
-    FaceTractions,
-    FileLoads,
-    GravityLoads,
-    LinearSolver,
-    MixtureLoads,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    PatchLoads,
-    Plane,
-    PointLoads,
-    Problem,
-    RandomLoads,
-    box,
-    rectangle,
-    solve,
-)
+from dpl import Scene, fem
 from dpl.fem.loads.forces import traction
-from dpl.fem.loads.sampling import direction, logarithmic
+from dpl.fem.loads.sampling import SAMPLINGS, direction, logarithmic
 from dpl.fem.loads.sized import softest_node
 from dpl.inference.training_range import RangeCheck
 
-END = Plane(0, "max")
+END = fem.Plane(0, "max")
 CABLE = [
     [[0.0, 5.0, 5.0], [50.0, 8.0, 5.0], [100.0, 5.0, 5.0]],
     [[10.0, 20.0, 20.0], [90.0, 20.0, 20.0]],
@@ -46,12 +26,12 @@ CABLE = [
 
 def body(*, scale=1.0, young=4500.0, nodes=(6, 3, 3)):
     """A beam 100 x 25 x 25 times `scale` m, held at x = 0."""
-    mesh = box([100.0 * scale, 25.0 * scale, 25.0 * scale], nodes)
-    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), young=young)
-    return LinearSolver(problem, linear="superlu")
+    mesh = fem.box([100.0 * scale, 25.0 * scale, 25.0 * scale], nodes)
+    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), fixed=fem.Plane(0, "min"), young=young)
+    return fem.LinearSolver(problem, linear="superlu")
 
 
-class SumLoads(RandomLoads):
+class SumLoads(fem.RandomLoads):
     """Random forces on all nodes of the boundary, which this family does not recognise."""
 
     largest_force = 1.0
@@ -83,18 +63,18 @@ def path(tmp_path_factory, linear):
 def build(path):
     """Builds each family by name, with options."""
     families = {
-        "modal": partial(ModalLoads, n_modes=3),
-        "patch": PatchLoads,
-        "point": PointLoads,
-        "traction": partial(FaceTractions, region=END),
-        "pressure": partial(FacePressure, region=END),
-        "gravity": GravityLoads,
-        "cable": partial(CableLoads, cables=CABLE),
-        "file": partial(FileLoads, path=path, factor=None),
+        "modal": partial(fem.ModalLoads, n_modes=3),
+        "patch": fem.PatchLoads,
+        "point": fem.PointLoads,
+        "traction": partial(fem.FaceTractions, region=END),
+        "pressure": partial(fem.FacePressure, region=END),
+        "gravity": fem.GravityLoads,
+        "cable": partial(fem.CableLoads, cables=CABLE),
+        "file": partial(fem.FileLoads, path=path, factor=None),
     }
     families["unrecognised"] = SumLoads
     members = {name: families[name] for name in FAMILIES[:-1]}
-    families["mixture"] = partial(MixtureLoads, families=members)
+    families["mixture"] = partial(fem.MixtureLoads, families=members)
 
     def build(name, linear, **options):
         return families[name](linear, young=linear.problem.young or [1e3, 1e5], **options)
@@ -103,15 +83,7 @@ def build(path):
 
 
 FAMILIES = (
-    "modal",
-    "patch",
-    "point",
-    "traction",
-    "pressure",
-    "gravity",
-    "cable",
-    "file",
-    "mixture",
+    *["modal", "patch", "point", "traction", "pressure", "gravity", "cable", "file", "mixture"],
 )
 SIZED = FAMILIES[1:-1]
 
@@ -122,10 +94,11 @@ def total(force):
 
 
 @pytest.mark.parametrize("name", FAMILIES)
-def test_a_load_is_a_function_of_seed_and_number(build, linear, name):
-    loads = build(name, linear)
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_a_load_is_a_function_of_seed_and_number(build, linear, name, sampling):
+    loads = build(name, linear, sampling=sampling)
     drawn = loads.sample(3, range(6)).force
-    assert torch.equal(drawn, build(name, linear).sample(3, range(6)).force)
+    assert torch.equal(drawn, build(name, linear, sampling=sampling).sample(3, range(6)).force)
     assert torch.equal(drawn[4:5], loads.sample(3, [4]).force)
     assert torch.equal(drawn, pickle.loads(pickle.dumps(loads)).sample(3, range(6)).force)
     assert not torch.equal(drawn, loads.sample(4, range(6)).force)
@@ -135,15 +108,15 @@ def test_a_load_is_a_function_of_seed_and_number(build, linear, name):
 @pytest.mark.parametrize("name", FAMILIES)
 def test_newton_answers_the_loads_of_each_family(build, name):
     problem = body(nodes=(5, 3, 3)).problem
-    newton = Newton(problem, linear="superlu")
+    newton = fem.Newton(problem, linear="superlu")
     if name == "file":  # its nodes are those of the larger beam
         problem = body().problem
-        newton = Newton(problem, linear="superlu")
-    families = {"families": {"patch": PatchLoads, "gravity": GravityLoads}}
+        newton = fem.Newton(problem, linear="superlu")
+    families = {"families": {"patch": fem.PatchLoads, "gravity": fem.GravityLoads}}
     loads = build(name, newton.linear_solver, **(families if name == "mixture" else {}))
     scene = Scene(problem, loads, newton)
     load = loads.sample(0, range(4))
-    assert solve(scene.solver, load).converged.all()
+    assert fem.solve(scene.solver, load).converged.all()
     assert scene.describe()[-1][1].startswith(type(loads).__name__)
     assert len(scene.fingerprint) == 64
 
@@ -186,8 +159,8 @@ def placed(loads, force):
     return {"out" if outside else "in" if known else "unknown" for outside, known in found}
 
 
-PUSH = partial(FacePressure, region=END, pressure=[10.0, 30.0])
-PULL = partial(CableLoads, cables=CABLE, tension=[1.0, 2.0])
+PUSH = partial(fem.FacePressure, region=END, pressure=[10.0, 30.0])
+PULL = partial(fem.CableLoads, cables=CABLE, tension=[1.0, 2.0])
 WHOLE = {"patch_radius": (2.0, 2.0), "distribution": partial(logarithmic, low=0.2)}
 UNSURE = "in/unknown out out/unknown out/unknown out unknown"
 PLACES = [  # own, 3 times the largest, 0.01 times, reversed, on inner nodes, a squeezing pair
@@ -208,7 +181,7 @@ PLACES = [  # own, 3 times the largest, 0.01 times, reversed, on inner nodes, a 
     ("file", {"factor": [0.5, 1.0]}, "in out out out out out"),
     ("file", {"factor": [-1.0, 1.0]}, "in out in in out out"),
     ("mixture", {}, "in out in in/out out in"),
-    ("mixture", {"families": {"a": PatchLoads, "b": GravityLoads}}, "in out in in out out"),
+    ("mixture", {"families": {"a": fem.PatchLoads, "b": fem.GravityLoads}}, "in out in in out out"),
     ("mixture", {"families": {"a": PUSH, "b": PULL}}, "in out out out out out"),
     ("unrecognised", {}, "unknown out unknown unknown out unknown"),
     ("mixture", {"families": {"a": PUSH, "b": SumLoads}}, UNSURE),
@@ -315,7 +288,7 @@ def sizes_of(force, problem):
 def test_tractions_add_up_to_area_times_stress():
     linear = body()
     problem = linear.problem
-    loads = FaceTractions(linear, 12.0, region=END, young=problem.young)
+    loads = fem.FaceTractions(linear, 12.0, region=END, young=problem.young)
     drawn = loads.sample(0, range(300))
     found = sizes_of(drawn.force, problem).norm(dim=1) / 25.0**2  # [Pa]
     assert 11.5 < float(found.max()) <= 12.0
@@ -329,10 +302,10 @@ def test_tractions_add_up_to_area_times_stress():
 def test_pressure_acts_inwards_and_that_on_a_closed_surface_is_in_balance():
     linear = body()
     problem = linear.problem
-    loads = FacePressure(linear, [2.0, 2.0], region=END, young=problem.young)
+    loads = fem.FacePressure(linear, [2.0, 2.0], region=END, young=problem.young)
     found = sizes_of(loads.sample(0, [0]).force, problem)[0]
     assert_close(found, torch.tensor([-2.0 * 25**2, 0, 0]).double(), rtol=1e-12, atol=1e-9)
-    force = FacePressure(linear, [2.0, 2.0], young=problem.young).sample(0, [0]).force
+    force = fem.FacePressure(linear, [2.0, 2.0], young=problem.young).sample(0, [0]).force
     assert total(force).abs().max() < 1e-16
     moment = torch.linalg.cross(problem.points, force[0]).sum(dim=0)
     assert moment.abs().max() < 1e-16
@@ -342,7 +315,7 @@ def test_pressure_acts_inwards_and_that_on_a_closed_surface_is_in_balance():
 def test_gravity_adds_up_to_the_weight():
     linear = body()
     problem = linear.problem
-    loads = GravityLoads(linear, 0.01, [9.81, 9.81], young=problem.young)
+    loads = fem.GravityLoads(linear, 0.01, [9.81, 9.81], young=problem.young)
     found = sizes_of(loads.sample(0, range(20)).force, problem).norm(dim=1)
     weight = torch.full((20,), 0.01 * 9.81 * 100 * 25 * 25, dtype=torch.float64)
     assert_close(found, weight, rtol=1e-12, atol=0)
@@ -351,12 +324,12 @@ def test_gravity_adds_up_to_the_weight():
 def test_a_cable_is_in_equilibrium_and_pulls_its_ends_together():
     linear = body()
     problem = linear.problem
-    loads = CableLoads(linear, CABLE, [70.0, 70.0], young=problem.young)
+    loads = fem.CableLoads(linear, CABLE, [70.0, 70.0], young=problem.young)
     force = loads.sample(0, [0]).force
     assert total(force).abs().max() < 1e-17
     moment = torch.linalg.cross(problem.points, force[0]).sum(dim=0)
     assert moment.abs().max() < 1e-17
-    straight = CableLoads(linear, CABLE[1:], [70.0, 70.0], young=problem.young)
+    straight = fem.CableLoads(linear, CABLE[1:], [70.0, 70.0], young=problem.young)
     pulls = straight.sample(0, [0]).force[0] * problem.young * problem.length**2
     left = problem.points[:, 0] < 0.5
     assert_close(pulls[left].sum(dim=0), torch.tensor([70.0, 0, 0]).double(), rtol=1e-12, atol=1e-9)
@@ -365,7 +338,7 @@ def test_a_cable_is_in_equilibrium_and_pulls_its_ends_together():
 
 def test_the_turn_of_a_cable_is_pulled_towards_the_inside():
     linear = body()
-    loads = CableLoads(linear, [[[0, 0, 12.5], [50, 25, 12.5], [100, 0, 12.5]]], young=1.0)
+    loads = fem.CableLoads(linear, [[[0, 0, 12.5], [50, 25, 12.5], [100, 0, 12.5]]], young=1.0)
     problem = linear.problem
     near = (problem.points[:, 0] - 0.5).abs() < 0.25
     pull = loads.shapes[0][near].sum(dim=0)
@@ -378,27 +351,29 @@ def test_the_turn_of_a_cable_is_pulled_towards_the_inside():
 @pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
 def test_the_families_of_the_surface_accept_every_element(cell, degree):
     dim = 3 if cell in ("tetra", "hexahedron") else 2
-    mesh = (box if dim == 3 else rectangle)([2.0, 1.0, 1.0][:dim], [5, 4, 4][:dim], cell)
-    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), degree=degree)
-    linear = LinearSolver(problem, linear="superlu")
+    mesh = (fem.box if dim == 3 else fem.rectangle)([2.0, 1.0, 1.0][:dim], [5, 4, 4][:dim], cell)
+    problem = fem.Problem.build(
+        mesh, fem.NeoHookeanLn(0.3), fixed=fem.Plane(0, "min"), degree=degree
+    )
+    linear = fem.LinearSolver(problem, linear="superlu")
     area = 0.5 ** (dim - 1)
-    for family in (PatchLoads, PointLoads, partial(FaceTractions, region=END)):
+    for family in (fem.PatchLoads, fem.PointLoads, partial(fem.FaceTractions, region=END)):
         loads = family(linear)
         drawn = loads.sample(0, range(10)).force
         assert drawn.isfinite().all()
         assert (problem.acting(drawn).flatten(1).norm(dim=1) > 0).all()
         assert placed(loads, drawn) == {"in"}
     assert float(loads.weights.sum()) == pytest.approx(area, rel=1e-12)
-    patches = PatchLoads(linear, patch_radius=(10.0, 10.0), region=END)
+    patches = fem.PatchLoads(linear, patch_radius=(10.0, 10.0), region=END)
     assert float(patches.weights_of(int(patches.centres[0]), 10.0).sum()) == pytest.approx(area)
     ends = [[0.3] * dim, [1.7, 0.6, 0.4][:dim]]
-    cable = CableLoads(linear, [ends])
+    cable = fem.CableLoads(linear, [ends])
     assert total(cable.shapes).abs().max() < 1e-14
 
 
 def horseshoe(gap):
     """Two legs 10 m long and 1 m wide along x, `gap` apart and joined at x = 0 only."""
-    mesh = box([10.0, 2.0 + gap, 1.0], [21, 11, 3])
+    mesh = fem.box([10.0, 2.0 + gap, 1.0], [21, 11, 3])
     middle = mesh.p[:, mesh.t].mean(axis=1)
     y = np.linspace(0, 2 + gap, 11)
     inside = (middle[0] > 1.0) & (middle[1] > y[4]) & (middle[1] < y[6])
@@ -407,8 +382,8 @@ def horseshoe(gap):
 
 def test_a_geodesic_disc_does_not_jump_across_a_gap():
     mesh = horseshoe(0.2)
-    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"))
-    loads = PatchLoads(LinearSolver(problem, linear="superlu"))
+    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), fixed=fem.Plane(0, "min"))
+    loads = fem.PatchLoads(fem.LinearSolver(problem, linear="superlu"))
     points = problem.points
     inner = (points[:, 0] == points[:, 0].max()) & (points[:, 1] < 0.11)
     tip = int(torch.where(inner, points[:, 1], -1.0).argmax())
@@ -423,7 +398,7 @@ def test_a_geodesic_disc_does_not_jump_across_a_gap():
 
 def test_small_discs_have_the_facets_around_their_centre():
     linear = body(nodes=(9, 5, 5))
-    loads = PatchLoads(linear, 3.0, (0.0, 0.0), young=4500.0, region=END)
+    loads = fem.PatchLoads(linear, 3.0, (0.0, 0.0), young=4500.0, region=END)
     face = 25.0 / 100 / 4
     sizes = {round(float(loads.weights_of(int(v), 0.0).sum()) / face**2, 6) for v in loads.centres}
     assert sizes == {1.0, 2.0, 4.0}, "corners, edges and the middle of the end"
@@ -433,11 +408,13 @@ def test_small_discs_have_the_facets_around_their_centre():
 
 @pytest.mark.parametrize("cell", ["tetra", "hexahedron"])
 def test_patches_are_recognised_between_rollers_also(cell):
-    problem = Problem.build(box([4.0, 1.0, 1.0], [7, 4, 4], cell), NeoHookeanLn(0.3), fixed=END)
+    problem = fem.Problem.build(
+        fem.box([4.0, 1.0, 1.0], [7, 4, 4], cell), fem.NeoHookeanLn(0.3), fixed=END
+    )
     at_0 = problem.points.numpy() < 1e-9
     fixed = at_0 | ~problem.free.numpy()  # each of three faces slides along itself
-    linear = LinearSolver(Problem.build(problem.mesh, NeoHookeanLn(0.3), fixed=fixed))
-    loads = PatchLoads(linear)
+    linear = fem.LinearSolver(fem.Problem.build(problem.mesh, fem.NeoHookeanLn(0.3), fixed=fixed))
+    loads = fem.PatchLoads(linear)
     points = loads.points(0, range(200))
     amplitude, distance = loads.project(loads.loads_at(points).force)
     assert (distance < 1e-9).all()
@@ -446,10 +423,10 @@ def test_patches_are_recognised_between_rollers_also(cell):
 
 
 def test_a_traction_that_is_not_uniform_is_no_patch(linear):
-    loads = PatchLoads(linear)
+    loads = fem.PatchLoads(linear)
     growing = partial(np.multiply, [[[1.0]], [[1.0]], [[0.5]]])
-    force = traction(linear.problem, Plane(2, "max"), lambda x: growing(x[:1]))
-    uniform = traction(linear.problem, Plane(2, "max"), lambda x: growing(np.ones_like(x[:1])))
+    force = traction(linear.problem, fem.Plane(2, "max"), lambda x: growing(x[:1]))
+    uniform = traction(linear.problem, fem.Plane(2, "max"), lambda x: growing(np.ones_like(x[:1])))
     distance = loads.project(torch.stack([uniform, force, -force]))[1]
     assert distance[0] < 1e-9
     assert (distance[1:] > 0.1).all()
@@ -458,15 +435,17 @@ def test_a_traction_that_is_not_uniform_is_no_patch(linear):
 def test_coefficients_that_no_fit_tells_apart_are_in_range_if_some_are(linear):
     same = [[[0.0, 0.0, 0.0], [40.0, 0.0, 0.0]], [[40.0, 0.0, 0.0], [80.0, 0.0, 0.0]]]
     both = [[[0.0, 0.0, 0.0], [80.0, 0.0, 0.0]]]  # the sum of these
-    cables = CableLoads(linear, [*same, *both], tension=[1.0, 2.0])
+    cables = fem.CableLoads(linear, [*same, *both], tension=[1.0, 2.0])
     assert placed(cables, torch.stack([cables.force_at(one) for one in np.eye(3)])) == {"in"}
-    nodes = ModalLoads(linear, n_modes=5, patch_radius=(0.0, 0.0))  # fewer components than modes
+    nodes = fem.ModalLoads(
+        linear, n_modes=5, patch_radius=(0.0, 0.0)
+    )  # fewer components than modes
     assert placed(nodes, nodes.sample(0, range(200)).force) == {"in"}
 
 
 def test_point_forces_act_on_as_many_nodes_as_drawn():
     linear = body()
-    loads = PointLoads(linear, 50.0, (2, 4), young=4500.0)
+    loads = fem.PointLoads(linear, 50.0, (2, 4), young=4500.0)
     force = loads.sample(0, range(300)).force
     counts = force.any(dim=2).sum(dim=1)
     assert set(counts.tolist()) == {2, 3, 4}
@@ -477,7 +456,7 @@ def test_point_forces_act_on_as_many_nodes_as_drawn():
 
 @pytest.mark.parametrize("name", ["modal", "patch", "point"])
 def test_a_region_restricts_where_loads_act(build, linear, name):
-    top = Plane(2, "max")
+    top = fem.Plane(2, "max")
     usual, loads = build(name, linear), build(name, linear, region=top)
     force = loads.sample(0, range(20)).force
     points = linear.problem.points
@@ -485,15 +464,13 @@ def test_a_region_restricts_where_loads_act(build, linear, name):
     assert not force[:, points[:, 2] < points[:, 2].max()].any()
     assert "region" not in usual.identity()
     assert loads.identity() != usual.identity()
-    same = Box([0.0, 0.0, 25.0], [100.0, 25.0, 25.0])  # the same facets
+    same = fem.Box([0.0, 0.0, 25.0], [100.0, 25.0, 25.0])  # the same facets
     assert build(name, linear, region=same).identity() == loads.identity()
 
 
 @pytest.mark.parametrize("name", ["modal", "patch", "point", "traction", "pressure"])
-def test_an_empty_or_fixed_region_is_refused_in_one_line(build, linear, name):
-    with pytest.raises(ValueError, match=r"^region = Plane\(axis=0, at=7.0\) holds no facet"):
-        build(name, linear, region=Plane(0, 7.0)).loadable_dofs  # noqa: B018
-    fixed = build(name, linear, region=Plane(0, "min"))
+def test_a_fixed_region_is_refused_in_one_line(build, linear, name):
+    fixed = build(name, linear, region=fem.Plane(0, "min"))
     with pytest.raises(ValueError, match=r"fixed everywhere|free node"):
         (fixed.loadable_dofs, fixed.largest_force)  # noqa: B018
 
@@ -503,15 +480,9 @@ def test_an_empty_or_fixed_region_is_refused_in_one_line(build, linear, name):
     [
         ("patch", {"largest": 0.0}, "largest = 0.0 must be a number above 0 [Pa], or null"),
         ("patch", {"largest": math.inf}, "largest = inf must be"),
-        ("patch", {"patch_radius": (0.5, 0.1)}, "patch_radius = [0.5, 0.1] must be"),
-        ("patch", {"deflection": 0.0}, "deflection = 0.0 must lie between"),
-        (
-            "point",
-            {"count": (0, 2)},
-            "count = [0, 2] must be a smallest and a largest number from 1",
-        ),
+        ("patch", {"deflection": 0.0}, "deflection = 0.0 must be a number from 1e-12 to 10 [times"),
+        ("point", {"count": (0, 2)}, "count = [0, 2] must be a smallest and a largest number from"),
         ("point", {"count": (3, 2)}, "count = [3, 2] must"),
-        ("traction", {"largest": -1.0}, "largest = -1.0 must"),
         ("pressure", {"pressure": (2.0, 1.0)}, "pressure = [2.0, 1.0] must be a smallest and a"),
         ("pressure", {"pressure": (0.0, 0.0)}, "pressure = [0.0, 0.0] must contain a number other"),
         ("gravity", {"density": -1.0}, "density = -1.0 must be a number above 0 [kg/m^3]"),
@@ -521,47 +492,42 @@ def test_an_empty_or_fixed_region_is_refused_in_one_line(build, linear, name):
         ("cable", {"cables": [[[0.0, 0.0, 0.0]]]}, "cables.0 = [[0.0, 0.0, 0.0]] must be two or"),
         (
             "cable",
-            {"cables": [[[0.0, 0.0], [1.0, 1.0]]]},
-            "cables.0 = [[0.0, 0.0], [1.0, 1.0]] must",
+            {"cables": [[[0, 0], [1, 1]]]},
+            "cables.0 = [[0, 0], [1, 1]] must be two or more",
         ),
         ("cable", {"cables": [[[1, 1, 1], [1, 1, 1]]]}, "cables.0 must not contain the same point"),
-        (
-            "cable",
-            {"cables": [CABLE[0], [[1, 1, 1], [1, 1, 99]]]},
-            "cables.1: the point [1.0, 1.0, 99",
-        ),
+        ("cable", {"cables": [CABLE[0], [[1, 1, 1], [1, 1, 99]]]}, "cables.1: the point [1.0, 1.0"),
         ("file", {"factor": (1.0,)}, "factor = [1.0] must be"),
         ("mixture", {"families": {}}, "families must contain one with a weight above 0"),
         ("mixture", {"weights": {"patch": -1.0}}, "weights.patch = -1.0 must be a number from 0"),
         ("mixture", {"weights": {"patches": 1.0}}, "weights.patches: there is no such family"),
+        (
+            "mixture",
+            {"families": {"b": partial(fem.PatchLoads, largest=-1.0)}},
+            "families.b: largest = -1.0 must",
+        ),
+        (
+            "mixture",
+            {"families": {"b": partial(fem.PatchLoads, region=fem.Plane(0, 7.0))}},
+            "families.b: region = Plane(axis=0, at=7.0) holds no facet",
+        ),
+        ("patch", {"region": fem.Plane(0, 7.0)}, "region = Plane(axis=0, at=7.0) holds no facet"),
+        ("point", {"count": (1, 60)}, "count = [1, 60] must be at most 41"),
     ],
 )
 def test_options_out_of_range_are_refused_in_one_line(build, linear, name, options, message):
-    with pytest.raises(ValueError, match=r".") as caught:
-        build(name, linear, **options)
-    assert str(caught.value).startswith(message)
-    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}.*$"):
+        build(name, linear, **options).largest_force  # noqa: B018
 
 
-def test_more_forces_than_free_nodes_are_refused(linear):
-    with pytest.raises(ValueError, match=r"^count = \[1, 60\] must be at most 41"):
-        PointLoads(linear, count=(1, 60)).largest_force  # noqa: B018
-
-
-def test_an_error_of_a_mixture_names_the_family(linear):
-    families = {"a": GravityLoads, "b": partial(PatchLoads, largest=-1.0)}
-    with pytest.raises(ValueError, match=r"^families\.b: largest = -1.0 must"):
-        MixtureLoads(linear, families)
-    empty = {"b": partial(PatchLoads, region=Plane(0, 7.0))}
-    with pytest.raises(ValueError, match=r"^families\.b: region = Plane"):
-        MixtureLoads(linear, empty).largest_force  # noqa: B018
+def test_a_member_of_a_mixture_must_be_random_loads(linear):
     with pytest.raises(TypeError, match=r"families\.c gives dict; it must give a RandomLoads"):
-        MixtureLoads(linear, {"c": dict})
+        fem.MixtureLoads(linear, {"c": dict})
 
 
 def test_loads_of_a_file_are_its_forces_times_a_factor(linear, path):
     problem = linear.problem
-    loads = FileLoads(linear, path, [0.5, 2.0], young=problem.young)
+    loads = fem.FileLoads(linear, path, [0.5, 2.0], young=problem.young)
     force = loads.sample(0, range(60)).force * problem.young * problem.length**2
     given = torch.from_numpy(np.load(path))
     seen = set()
@@ -577,9 +543,9 @@ def test_a_file_is_identified_by_its_forces(linear, path, tmp_path):
     copy, other = tmp_path / "copy.npz", tmp_path / "other.npy"
     np.savez(copy, forces=np.load(path))
     np.save(other, np.load(path)[:2])
-    one, same, less = (FileLoads(linear, str(p), young=4500.0) for p in (path, copy, other))
+    one, same, less = (fem.FileLoads(linear, str(p), young=4500.0) for p in (path, copy, other))
     assert one.identity() == same.identity() != less.identity()
-    assert FileLoads(body(young=9000.0), path, young=9000.0).identity() != one.identity()
+    assert fem.FileLoads(body(young=9000.0), path, young=9000.0).identity() != one.identity()
 
 
 def test_files_that_cannot_be_used_are_refused_in_one_line(linear, tmp_path):
@@ -600,15 +566,19 @@ def test_files_that_cannot_be_used_are_refused_in_one_line(linear, tmp_path):
         if array is not None:
             np.save(path, array)
         with pytest.raises(ValueError, match=r".") as caught:
-            FileLoads(linear, str(path))
+            fem.FileLoads(linear, str(path))
         assert str(caught.value).startswith(f"path = {path}: ")
         assert any(part in str(caught.value) for part in message.split("|"))
         assert "\n" not in str(caught.value)
 
 
 def test_a_mixture_draws_its_families_by_weight_and_names_them(linear):
-    families = {"modal": partial(ModalLoads, n_modes=3), "point": PointLoads, "none": GravityLoads}
-    loads = MixtureLoads(linear, families, {"modal": 3.0, "none": 0.0})
+    families = {
+        "modal": partial(fem.ModalLoads, n_modes=3),
+        "point": fem.PointLoads,
+        "none": fem.GravityLoads,
+    }
+    loads = fem.MixtureLoads(linear, families, {"modal": 3.0, "none": 0.0})
     assert loads.names == ("modal", "point", "none")
     points = loads.points(0, range(4000))
     counts = torch.bincount(loads.family_of(points), minlength=3)
@@ -623,13 +593,13 @@ def test_a_mixture_draws_its_families_by_weight_and_names_them(linear):
         assert torch.equal(one, family.force_at(point[1 : 1 + family.n_force].numpy()))
     assert loads.n_random == 2 + max(family.n_force for family in loads.members)
     assert list(loads.arrays()) == ["modal.values", "modal.vectors"]
-    twice = MixtureLoads(linear, families, {"modal": 6.0, "point": 2.0, "none": 0.0})
+    twice = fem.MixtureLoads(linear, families, {"modal": 6.0, "point": 2.0, "none": 0.0})
     assert twice.identity() == loads.identity()
 
 
 def test_a_mixture_recognises_the_family_that_fits_best(linear):
-    families = {"end": partial(FaceTractions, region=END), "weight": GravityLoads}
-    loads = MixtureLoads(linear, families)
+    families = {"end": partial(fem.FaceTractions, region=END), "weight": fem.GravityLoads}
+    loads = fem.MixtureLoads(linear, families)
     for number, member in enumerate(loads.members):
         force = 1.5 * member.sample(5, range(4)).force
         amplitude, distance = loads.project(force)
@@ -638,10 +608,14 @@ def test_a_mixture_recognises_the_family_that_fits_best(linear):
 
 
 def test_mixtures_share_young_and_parameters_of_the_law():
-    mesh = box([4.0, 1.0, 1.0], [5, 3, 3])
-    problem = Problem.build(mesh, NeoHookeanLn([0.2, 0.4]), fixed=Plane(0, "min"), young=None)
-    linear = LinearSolver(problem, linear="superlu")
-    loads = MixtureLoads(linear, {"patch": PatchLoads, "point": PointLoads}, young=[1e3, 1e5])
+    mesh = fem.box([4.0, 1.0, 1.0], [5, 3, 3])
+    problem = fem.Problem.build(
+        mesh, fem.NeoHookeanLn([0.2, 0.4]), fixed=fem.Plane(0, "min"), young=None
+    )
+    linear = fem.LinearSolver(problem, linear="superlu")
+    loads = fem.MixtureLoads(
+        linear, {"patch": fem.PatchLoads, "point": fem.PointLoads}, young=[1e3, 1e5]
+    )
     load = loads.sample(0, range(50))
     assert float(load.young.min()) < 2e4 < 8e4 < float(load.young.max())
     assert float(load.parameters.min()) < 0.25 < 0.35 < float(load.parameters.max())

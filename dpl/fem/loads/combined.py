@@ -76,11 +76,7 @@ class CombinedLoads(SizedLoads):
         return torch.tensordot(torch.from_numpy(self.coefficients_at(point)), self.shapes, dims=1)
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
-        """Return amplitudes (B,) and relative residuals (B,) of a least-squares fit.
-
-        Args:
-            force: (B, N, D) [-].
-        """
+        """Return amplitudes and relative residuals of a least-squares fit, see `LoadFamily`."""
         shapes, span = self._acting_shapes, self.coefficient_range
         fits = [fit(shapes, own, *span) for own in self.own_force(force).flatten(1).numpy()]
         largest = [self.amplitudes(self.sizes_of(c)).max() for c, _ in fits]

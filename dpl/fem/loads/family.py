@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from dpl.fem.identity import identity_of
+from dpl.fem.loads.options import check_options
 from dpl.fem.loads.sampling import SAMPLINGS, Array
-from dpl.fem.loads.young import Young, YoungRange
 from dpl.fem.problem import Problem
-from dpl.fem.ranges import ParameterRange
+from dpl.fem.ranges import ParameterRange, Young
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
 
@@ -37,8 +37,8 @@ class LoadFamily(Protocol):
         ...
 
     @property
-    def young_range(self) -> tuple[float, float]:
-        """Smallest and largest Young's modulus [Pa]."""
+    def moduli(self) -> ParameterRange:
+        """Range of Young's moduli with its distribution [Pa]; without width for one modulus."""
         ...
 
     @property
@@ -129,32 +129,18 @@ class HasModes(Protocol):
         ...
 
 
-@runtime_checkable
-class HasModuli(Protocol):
-    """Load family that names the distribution of its Young's moduli."""
-
-    @property
-    def moduli(self) -> YoungRange:
-        """Range of Young's moduli with its distribution."""
-        ...
-
-
-def moduli_of(loads: LoadFamily) -> YoungRange:
-    """Return the range of the Young's moduli of a family; uniform if it names no distribution."""
-    return loads.moduli if isinstance(loads, HasModuli) else YoungRange(*loads.young_range)
-
-
 @dataclass(frozen=True, eq=False)
 class RandomLoads(LoadFamily):
     """Base of load families: subclasses define the force of a point of the unit cube.
 
     A subclass defines `n_force`, `force_at` and `largest_force`. It overrides `project` if it can
-    recognise its forces, and `loadable_dofs` if it loads nodes inside the body.
+    recognise its forces, and `loadable_dofs` if it loads nodes inside the body. Options that it
+    declares by `option` are checked here.
 
     Attributes:
         linear: Body, with the factor of its K(0).
-        young: Young's modulus [Pa], a range [low, high] from which each load draws one, or a
-            mapping with the attributes of `YoungRange`.
+        young: Young's modulus [Pa], a range [low, high] from which each load draws one, or
+            {low, high, distribution}: "uniform", or "log" where log E is uniform.
         constant_force: Force that is part of every load, (N, D) [-]; none if left out.
         sampling: "independent" points of the unit cube, or a "sobol" sequence.
     """
@@ -166,11 +152,7 @@ class RandomLoads(LoadFamily):
     sampling: str = "independent"
 
     def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ValueError: An attribute is out of range.
-        """
+        check_options(self)
         if self.sampling not in SAMPLINGS:
             raise ValueError(f"sampling = {self.sampling!r} must be {' or '.join(SAMPLINGS)}")
         self.moduli  # noqa: B018  # raises if it is out of range
@@ -193,14 +175,9 @@ class RandomLoads(LoadFamily):
         return self.linear.problem
 
     @cached_property
-    def moduli(self) -> YoungRange:
-        """Range of Young's moduli with its distribution."""
-        return YoungRange.of(self.young)
-
-    @property
-    def young_range(self) -> tuple[float, float]:
-        """Smallest and largest Young's modulus [Pa]."""
-        return self.moduli.low, self.moduli.high
+    def moduli(self) -> ParameterRange:
+        """Range of Young's moduli with its distribution [Pa]."""
+        return ParameterRange.of_young(self.young)
 
     @property
     def parameter_ranges(self) -> Mapping[str, ParameterRange]:
@@ -231,7 +208,8 @@ class RandomLoads(LoadFamily):
 
     def young_at(self, points: Tensor) -> Tensor:
         """Return the Young's moduli of points (B, d), (B,) [Pa]."""
-        return self.moduli.at(points[:, self.n_force])
+        moduli: Tensor = self.moduli.at(points[:, self.n_force])
+        return moduli.clamp(*self.moduli)  # rounding of a power
 
     def parameters_at(self, points: Tensor) -> Tensor:
         """Return the parameters of the law of points (B, d), (B, P), see `parameter_ranges`."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +14,8 @@ from torch import Tensor
 from dpl.fem.identity import plain
 from dpl.fem.loads.combined import CombinedLoads
 from dpl.fem.loads.fit import best_fit
+from dpl.fem.loads.options import option
 from dpl.fem.loads.sampling import Array
-from dpl.fem.loads.sized import check_range
 from dpl.system.files import read_array
 
 
@@ -33,17 +33,10 @@ class FileLoads(CombinedLoads):
             has no effect.
     """
 
-    si_options: ClassVar[tuple[str, ...]] = ("path", "factor")
     path: str | Path
-    factor: Sequence[float] | None = (0.0, 1.0)
+    factor: Sequence[float] | None = option("", default=(0.0, 1.0), nonzero=True)
 
     def __post_init__(self) -> None:
-        """Check the ranges and the file.
-
-        Raises:
-            ValueError: An attribute is out of range, or the file cannot be used.
-        """
-        check_range("factor", self.factor, "-")
         super().__post_init__()
         self.shapes  # noqa: B018  # raises if the file cannot be used
 
@@ -96,11 +89,7 @@ class FileLoads(CombinedLoads):
         return float(self.problem.acting(self.shapes).flatten(1).norm(dim=1).max())
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
-        """Return amplitudes (B,) and relative residuals (B,) for the force that fits best.
-
-        Args:
-            force: (B, N, D) [-].
-        """
+        """Return amplitudes (B,) and relative residuals (B,) for the force that fits best."""
         shapes = torch.from_numpy(self._acting_shapes)  # (N D, S)
         own = self.own_force(force).flatten(1)
         products, squares = own @ shapes, shapes.square().sum(dim=0)
@@ -114,7 +103,9 @@ class FileLoads(CombinedLoads):
 
     def identity(self) -> dict[str, Any]:
         """Return the options; the file is identified by its forces over the largest component."""
-        return super().identity() | {"forces": plain(self.shapes)}
+        options = super().identity()
+        del options["path"], options["factor"]
+        return options | {"forces": plain(self.shapes)}
 
 
 def read_forces(path: str | Path, free: NDArray[np.bool_]) -> Array:

@@ -34,11 +34,6 @@ class MixtureLoads(RandomLoads):
     weights: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
-        """Check the weights and build the families.
-
-        Raises:
-            ValueError: A weight is out of range, or a family cannot be built.
-        """
         super().__post_init__()
         weights = self.weights or {}
         for name in weights:
@@ -122,9 +117,6 @@ class MixtureLoads(RandomLoads):
         It is the one of the smallest distance, and of the smallest amplitude among those to which
         the force belongs. If it belongs to none, and a family cannot recognise its loads, the
         distance is NaN.
-
-        Args:
-            force: (B, N, D) [-].
         """
         own = self.own_force(force)
         fits = [torch.stack(member.project(own), dim=1) for member in self.members]

@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from dpl.fem.loads.fit import amplitudes, fit
-from dpl.fem.loads.modal_basis import Array, Modes, eigenmodes
-from dpl.fem.loads.sampling import Quantile, constant, symmetric_uniform, uniform01
-from dpl.fem.loads.sized import check_deflection
-from dpl.fem.loads.surface import SurfaceLoads, check_patch_radius
+from dpl.fem.loads.modal_basis import Modes, eigenmodes
+from dpl.fem.loads.options import option
+from dpl.fem.loads.sampling import Array, Quantile, constant, symmetric_uniform, uniform01
+from dpl.fem.loads.sized import MIN_DEFLECTION
+from dpl.fem.loads.surface import SurfaceLoads
 
 TESTED = np.linspace(0.0, 1 - 2.0**-53, 1001)  # numbers at which distributions are examined
 
@@ -52,34 +53,21 @@ class ModalLoads(SurfaceLoads):
             names the same mode on every machine.
     """
 
-    n_modes: int = 5
-    deflection: float = 0.4
-    patch_radius: Sequence[float] = (0.0, 1.0)
+    n_modes: int = option("", default=5, least=1)
+    deflection: float = option("times L", default=0.4, least=MIN_DEFLECTION, most=10.0)
+    patch_radius: Sequence[float] = option("times L", default=(0.0, 1.0), least=0.0)
     distribution: Quantile = symmetric_uniform
-    eigenvalue_exponent: float = 0.5
+    eigenvalue_exponent: float = option("", default=0.5, least=-1.0, most=2.0)
     radius: Quantile = uniform01
     amplitude: Quantile = constant
     modes: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ValueError: An attribute is out of range.
-        """
-        if self.n_modes < 1:
-            raise ValueError(f"n_modes = {self.n_modes} must be 1 or more")
+        super().__post_init__()
         if self.modes is not None and not _is_selection(self.modes):
             raise ValueError(
                 f"modes = {list(self.modes)} must be ascending whole numbers, 0 or more, or null"
             )
-        check_deflection(self.deflection)
-        check_patch_radius(self.patch_radius)
-        if not -1 <= self.eigenvalue_exponent <= 2:
-            raise ValueError(
-                f"eigenvalue_exponent = {self.eigenvalue_exponent} must lie between -1 and 2"
-            )
-        super().__post_init__()
         for name, low in (("distribution", -1.0), ("radius", 0.0), ("amplitude", 0.0)):
             drawn = getattr(self, name)(TESTED)
             if not ((drawn >= low) & (drawn <= 1)).all():

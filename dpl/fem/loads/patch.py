@@ -13,15 +13,10 @@ from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from dpl.fem.loads.forces import ROUNDOFF, facet_areas
+from dpl.fem.loads.options import option
 from dpl.fem.loads.sampling import Array
-from dpl.fem.loads.sized import (
-    SizedLoads,
-    check_largest,
-    largest_deflection,
-    softest_node,
-    traction_sizes,
-)
-from dpl.fem.loads.surface import SurfaceLoads, check_patch_radius
+from dpl.fem.loads.sized import SizedLoads, largest_deflection, softest_node
+from dpl.fem.loads.surface import SurfaceLoads
 
 MAX_ROUNDS = 5  # of decisions about loaded facets; a disc away from supports needs one or two
 
@@ -43,23 +38,8 @@ class PatchLoads(SurfaceLoads, SizedLoads):
         patch_radius: Smallest and largest radius of the disc over L [-].
     """
 
-    largest: float | None = None
-    patch_radius: Sequence[float] = (0.0, 0.5)
-
-    def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ValueError: An attribute is out of range.
-        """
-        check_largest("largest", self.largest, "Pa")
-        check_patch_radius(self.patch_radius)
-        super().__post_init__()
-
-    @property
-    def given_sizes(self) -> Array | None:
-        """0 and the largest traction over E, (2,) [-]."""
-        return traction_sizes(self.problem.units, self.largest)
+    largest: float | None = option("Pa", default=None, above=0.0)
+    patch_radius: Sequence[float] = option("times L", default=(0.0, 0.5), least=0.0)
 
     @property
     def unit_deflection(self) -> float:
@@ -95,9 +75,6 @@ class PatchLoads(SurfaceLoads, SizedLoads):
 
         The residual is that of the uniform traction that fits best, in the direction of this nodal
         force and on the facets that are loaded. These facets need not be a disc.
-
-        Args:
-            force: (B, N, D) [-].
         """
         pairs = [self._fit(own) for own in self.own_force(force).numpy()]
         tractions, residuals = zip(*pairs, strict=True)

@@ -8,14 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.fem.loads.options import option
 from dpl.fem.loads.sampling import Array
-from dpl.fem.loads.sized import (
-    SizedLoads,
-    check_largest,
-    largest_deflection,
-    point_forces,
-    softest_node,
-)
+from dpl.fem.loads.sized import SizedLoads, largest_deflection, point_forces, softest_node
 from dpl.fem.loads.surface import SurfaceLoads
 
 
@@ -32,22 +27,8 @@ class PointLoads(SurfaceLoads, SizedLoads):
         count: Smallest and largest number of forces, on different nodes.
     """
 
-    largest: float | None = None
-    count: Sequence[int] = (1, 3)
-
-    def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ValueError: An attribute is out of range.
-        """
-        check_largest("largest", self.largest, "N")
-        low, high = self.count if len(self.count) == 2 else (1, 0)
-        if not 1 <= low <= high:
-            raise ValueError(
-                f"count = {list(self.count)} must be a smallest and a largest number from 1"
-            )
-        super().__post_init__()
+    largest: float | None = option("N", default=None, above=0.0)
+    count: Sequence[int] = option("", default=(1, 3), least=1)
 
     @cached_property
     def nodes(self) -> Tensor:
@@ -64,19 +45,10 @@ class PointLoads(SurfaceLoads, SizedLoads):
         return nodes
 
     @property
-    def given_sizes(self) -> Array | None:
-        """0 and the largest force over E L^(D - 1), (2,) [-]."""
-        if self.largest is None:
-            return None
-        sizes, dim = np.array([0.0, self.largest]), self.problem.shape[1]
-        return self.problem.units.force(sizes, dim, f"largest = {self.largest}")
-
-    @property
     def unit_deflection(self) -> float:
         """Largest linear deflection [-] of all forces of size 1 at the softest node."""
         linear = self.linear.reference
-        softest = torch.tensor([softest_node(linear, self.nodes)])
-        axes = point_forces(self.problem.shape, softest)
+        axes = point_forces(self.problem.shape, [softest_node(linear, self.nodes)])
         return self.count[1] * largest_deflection(linear, axes)
 
     @property
@@ -103,11 +75,7 @@ class PointLoads(SurfaceLoads, SizedLoads):
         return force
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the largest nodal force over `largest`, (B,), and the part on further nodes, (B,).
-
-        Args:
-            force: (B, N, D) [-].
-        """
+        """Return largest nodal forces over `largest` and the parts on further nodes, (B,) each."""
         own = self.own_force(force)
         here = torch.where(self.loadable_dofs, own, 0.0).norm(dim=2)
         sizes = here.sort(dim=1, descending=True).values

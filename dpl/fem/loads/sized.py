@@ -13,9 +13,9 @@ from torch import Tensor
 
 from dpl.fem.loads.family import RandomLoads
 from dpl.fem.loads.fit import amplitudes
+from dpl.fem.loads.options import DIMENSIONLESS, declared, option, shown
 from dpl.fem.loads.sampling import Array, direction
 from dpl.fem.solvers.linear import LinearSolver
-from dpl.fem.units import Units
 
 MIN_DEFLECTION = 1e-12  # below it the displacement is rounding error [-]
 DIGITS = 12  # digits of a size that identify a family; the last ones depend on units
@@ -25,8 +25,8 @@ DIGITS = 12  # digits of a size that identify a family; the last ones depend on 
 class SizedLoads(RandomLoads):
     """Base of load families whose forces have a random size.
 
-    A subclass defines `given_sizes` and `unit_deflection`, and names its options in SI units in
-    `si_options`.
+    A subclass defines `unit_deflection`, and declares an option in Pa or N: the largest size, or
+    the range of sizes. `size_option` is its name.
 
     Attributes:
         deflection: Largest linear deflection over L [-]: the sizes lie between 0 and the size at
@@ -34,26 +34,25 @@ class SizedLoads(RandomLoads):
     """
 
     _: KW_ONLY
-    deflection: float = 0.2
-    si_options: ClassVar[tuple[str, ...]] = ("largest",)
-
-    def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ValueError: An attribute is out of range.
-        """
-        check_deflection(self.deflection)
-        super().__post_init__()
+    deflection: float = option("times L", default=0.2, least=MIN_DEFLECTION, most=10.0)
+    size_option: ClassVar[str] = "largest"
 
     @property
-    @abstractmethod
     def given_sizes(self) -> Array | None:
         """Smallest and largest size in the options, (2,) [-]; None if `deflection` decides.
 
         Raises:
             ValueError: The loads have a range of moduli.
         """
+        name, units = self.size_option, self.problem.units
+        if (value := getattr(self, name)) is None:
+            return None
+        unit = next(bounds.unit for one, bounds in declared(self) if one.name == name)
+        ends = np.array(value if isinstance(value, Sequence) else [0.0, value], dtype=np.float64)
+        words = f"{name} = {shown(value)}"
+        if unit == "Pa":
+            return units.stress(ends, words)
+        return units.force(ends, self.problem.shape[1], words)
 
     @property
     @abstractmethod
@@ -94,10 +93,14 @@ class SizedLoads(RandomLoads):
 
     def identity(self) -> dict[str, Any]:
         """Return the options with those in SI units as `sizes`, or with `deflection`."""
-        given = self.given_sizes
-        unused = self.si_options if given is None else (*self.si_options, "deflection")
-        options = {name: one for name, one in super().identity().items() if name not in unused}
-        return options if given is None else options | {"sizes": rounded(given)}
+        given, options = self.given_sizes, super().identity()
+        for one, bounds in declared(self):
+            if bounds.unit not in DIMENSIONLESS:
+                del options[one.name]
+        if given is None:
+            return options
+        del options["deflection"]
+        return options | {"sizes": rounded(given)}
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle with the sizes, so that workers need not compute them again."""
@@ -110,64 +113,6 @@ def rounded(values: Array) -> list[float]:
     return [float(f"{value:.{DIGITS}g}") for value in values]
 
 
-def check_deflection(deflection: float) -> None:
-    """Check a deflection over L.
-
-    Raises:
-        ValueError: It is out of range.
-    """
-    if not MIN_DEFLECTION <= deflection <= 10:
-        span = f"between {MIN_DEFLECTION:g} and 10 (times L)"
-        raise ValueError(f"deflection = {deflection} must lie {span}")
-
-
-def check_largest(name: str, value: float | None, unit: str) -> None:
-    """Check a largest size, which may be left out.
-
-    Raises:
-        ValueError: It is not a positive number.
-    """
-    if value is not None and not 0 < value < math.inf:
-        raise ValueError(f"{name} = {value} must be a number above 0 [{unit}], or null")
-
-
-def check_range(
-    name: str, value: Sequence[float] | None, unit: str, *, least: float = -math.inf
-) -> None:
-    """Check a range, which may be left out.
-
-    Args:
-        name: Name of the option.
-        value: Smallest and largest value.
-        unit: Unit, for the message.
-        least: Least smallest value.
-
-    Raises:
-        ValueError: The range is not ascending or finite, begins below `least` or is 0 only.
-    """
-    if value is None:
-        return
-    low, high = value if len(value) == 2 else (math.nan, math.nan)
-    if not (least <= low <= high and math.isfinite(low) and math.isfinite(high)):
-        span = "" if least == -math.inf else f" from {least:g}"
-        raise ValueError(
-            f"{name} = {list(value)} must be a smallest and a largest number{span} [{unit}]"
-        )
-    if low == high == 0:
-        raise ValueError(f"{name} = {list(value)} must contain a number other than 0 [{unit}]")
-
-
-def traction_sizes(units: Units, largest: float | None) -> Array | None:
-    """Return 0 and a largest traction [Pa] over E, (2,) [-]; None if it is left out.
-
-    Raises:
-        ValueError: The loads have a range of moduli.
-    """
-    if largest is None:
-        return None
-    return units.stress(np.array([0.0, largest]), f"largest = {largest}")
-
-
 def largest_deflection(linear: LinearSolver, axes: Tensor) -> float:
     """Return the largest linear deflection of a combination of forces with |c| = 1 [-].
 
@@ -175,16 +120,7 @@ def largest_deflection(linear: LinearSolver, axes: Tensor) -> float:
         linear: The body.
         axes: The forces (K, N, D) [-].
     """
-    moved = torch.stack([linear.solve_force(force) for force in axes], dim=-1)  # (N, D, K)
-    return float(torch.linalg.matrix_norm(moved, 2).max())
-
-
-def point_forces(shape: Sequence[int], nodes: Tensor) -> Tensor:
-    """Return unit forces at each of some nodes (n,) along each axis, (D, N, D)."""
-    forces = torch.zeros(shape[1], *shape, dtype=torch.float64)
-    for axis in range(shape[1]):
-        forces[axis, nodes, axis] = 1.0
-    return forces
+    return float(_moved(linear, axes).max())
 
 
 def softest_node(linear: LinearSolver, nodes: Tensor) -> int:
@@ -195,14 +131,25 @@ def softest_node(linear: LinearSolver, nodes: Tensor) -> int:
     The search begins at the node that forces on all nodes move most, and goes to softer nodes until
     there is none.
     """
-    shape = linear.problem.shape
-    forces = point_forces(shape, nodes)
     found: int | None = None
     while True:
-        moved = torch.stack([linear.solve_force(force) for force in forces], dim=-1)  # (N, D, D)
-        sizes = torch.linalg.matrix_norm(moved, 2)
+        forces = point_forces(linear.problem.shape, nodes if found is None else [found])
+        sizes = _moved(linear, forces)
         best = int(nodes[int(sizes[nodes].argmax())])
         if found is not None and not sizes[best] > sizes[found] * (1 + 1e-9):
             return found
         found = best
-        forces = point_forces(shape, torch.tensor([found]))
+
+
+def point_forces(shape: Sequence[int], nodes: Tensor | list[int]) -> Tensor:
+    """Return unit forces at each of some nodes (n,) along each axis, (D, N, D)."""
+    forces = torch.zeros(shape[1], *shape, dtype=torch.float64)
+    for axis in range(shape[1]):
+        forces[axis, nodes, axis] = 1.0
+    return forces
+
+
+def _moved(linear: LinearSolver, axes: Tensor) -> Tensor:
+    """Return the largest linear deflection of each node by c_k f_k (K, N, D) with |c| = 1, (N,)."""
+    moved = torch.stack([linear.solve_force(force) for force in axes], dim=-1)  # (N, D, K)
+    return torch.linalg.matrix_norm(moved, 2)

@@ -1,7 +1,5 @@
 """Base of load families that act on the boundary or on a region of it."""
 
-import math
-from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Any
@@ -61,15 +59,3 @@ class SurfaceLoads(RandomLoads):
         options = super().identity()
         del options["region"]
         return options if self.region is None else options | {"region": plain(self.facets)}
-
-
-def check_patch_radius(patch_radius: Sequence[float]) -> None:
-    """Check a range of radii over L.
-
-    Raises:
-        ValueError: The radii are not two ascending numbers from 0.
-    """
-    low, high = patch_radius if len(patch_radius) == 2 else (1, 0)
-    if not 0 <= low <= high < math.inf:
-        found = f"patch_radius = {list(patch_radius)}"
-        raise ValueError(f"{found} must be a smallest and a largest radius over L")

@@ -1,4 +1,4 @@
-"""Cables through a body with random tensions."""
+"""Families of loads on a face, in the volume and along cables: few fixed forces each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,14 +9,95 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.loads.combined import CombinedLoads
-from dpl.fem.loads.forces import ROUNDOFF
+from dpl.fem.assembly.follower_pressure import PressureSurface
+from dpl.fem.loads.combined import CombinedLoads, VectorLoads
+from dpl.fem.loads.forces import ROUNDOFF, body_force, facet_areas
+from dpl.fem.loads.options import option
 from dpl.fem.loads.sampling import Array
-from dpl.fem.loads.sized import check_range, rounded
+from dpl.fem.loads.sized import rounded
+from dpl.fem.loads.surface import SurfaceLoads
 from dpl.fem.problem import Problem
 from dpl.system.checks import named_errors
 
 INWARD = 1e-7  # shift of points on the surface into their cell, over the distance to its centre [-]
+
+
+@dataclass(frozen=True, eq=False)
+class FaceTractions(SurfaceLoads, VectorLoads):
+    """Uniform dead traction of random direction and size on the whole region.
+
+    The point of a load has the size and the direction, then Young's modulus and, where the law has
+    ranges, its parameters.
+
+    Attributes:
+        largest: Largest traction [Pa]; None: `deflection` decides.
+    """
+
+    largest: float | None = option("Pa", default=None, above=0.0)
+
+    @cached_property
+    def weights(self) -> Tensor:
+        """Integral of each shape function over the region, (N,) [-]."""
+        areas = facet_areas(self.problem, self.facets)
+        return torch.from_numpy(np.asarray(areas.sum(axis=1)).ravel())
+
+
+@dataclass(frozen=True, eq=False)
+class FacePressure(SurfaceLoads, CombinedLoads):
+    """Uniform dead pressure of random size on the whole region.
+
+    It acts against the outward normal of the undeformed body.
+
+    The point of a load has the size, then Young's modulus and, where the law has ranges, its
+    parameters.
+
+    Attributes:
+        pressure: Smallest and largest pressure [Pa]; None: from 0, `deflection` decides.
+    """
+
+    size_option: ClassVar[str] = "pressure"
+    pressure: Sequence[float] | None = option("Pa", default=None, nonzero=True)
+
+    @cached_property
+    def shapes(self) -> Tensor:
+        """Force of the pressure 1 on the undeformed surface, (1, N, D) [-]."""
+        surface = PressureSurface.build(self.problem.basis, self.facets, 1.0)
+        force = -surface.force(torch.zeros(1, *self.problem.shape, dtype=torch.float64))
+        return torch.where(force.abs() > ROUNDOFF * force.abs().max(), force, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class GravityLoads(VectorLoads):
+    """Weight of the body in random directions, with accelerations of random size.
+
+    The nodal forces are consistent: at corners of quadratic tetrahedra they act against gravity.
+
+    The point of a load has the size and the direction, then Young's modulus and, where the law has
+    ranges, its parameters.
+
+    Attributes:
+        density: Mass per rest volume [kg/m^3]; None: `deflection` decides.
+        acceleration: Smallest and largest acceleration [m/s^2]; not used without `density`.
+    """
+
+    density: float | None = option("kg/m^3", default=None, above=0.0)
+    acceleration: Sequence[float] = option("m/s^2", default=(0.0, 9.81), least=0.0, nonzero=True)
+
+    @property
+    def given_sizes(self) -> Array | None:
+        """Smallest and largest weight per volume times L / E, (2,) [-]."""
+        if self.density is None:
+            return None
+        weight = self.density * np.asarray(self.acceleration, dtype=np.float64)
+        return self.problem.units.stress_gradient(weight, f"density = {self.density}")
+
+    @cached_property
+    def weights(self) -> Tensor:
+        """Integral of each shape function over the body, (N,) [-].
+
+        Integrals at corners of quadratic tetrahedra are negative: no masses of the nodes.
+        """
+        return body_force(self.problem, np.ones_like)[:, 0].contiguous()
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,27 +116,13 @@ class CableLoads(CombinedLoads):
         tension: Smallest and largest tension [N] (2D: [N/m]); None: from 0, `deflection` decides.
     """
 
-    si_options: ClassVar[tuple[str, ...]] = ("tension", "cables")
+    size_option: ClassVar[str] = "tension"
     cables: Sequence[Sequence[Sequence[float]]]
-    tension: Sequence[float] | None = None
+    tension: Sequence[float] | None = option("N", default=None, least=0.0, nonzero=True)
 
     def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ValueError: An attribute is out of range, or a point lies outside the body.
-        """
-        check_range("tension", self.tension, "N", least=0.0)
         super().__post_init__()
         self.shapes  # noqa: B018  # raises if a cable is invalid
-
-    @property
-    def given_sizes(self) -> Array | None:
-        """Smallest and largest tension over E L^(D - 1), (2,) [-]."""
-        if self.tension is None:
-            return None
-        words, dim = f"tension = {list(self.tension)}", self.problem.shape[1]
-        return self.problem.units.force(np.asarray(self.tension, dtype=np.float64), dim, words)
 
     @cached_property
     def shapes(self) -> Tensor:
