@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem import Load
-from dpl.fem.rom.stiffness_iteration import check_terms
+from dpl.fem.rom.stiffness_iteration import StiffnessIteration
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.models.linear_response import LinearResponse
 from dpl.models.whitening import FieldWhitening
@@ -66,10 +66,10 @@ class LinearBase:
             linear: Linear solutions of random loads, (S, N, D); None for `sampled_solutions`.
 
         Raises:
-            ValueError: K(0) changes too much with the parameters, see `check_terms`.
+            ValueError: K(0) changes too much with the parameters, see `StiffnessIteration`.
         """
         self._scene, self._problem = scene, scene.problem
-        check_terms(StiffnessTerms.of(scene.problem))
+        StiffnessIteration.of_terms(StiffnessTerms.of(scene.problem))  # may raise
         if linear is None:
             linear = sampled_solutions(scene)[1]
         fields = self.scale_inputs(linear, linear.new_ones(())).field

@@ -1,37 +1,37 @@
 """The linear solution K(0)^-1 f of every load, by nested static condensation."""
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd import Function
 from torch.nn.functional import pad
 
-from dpl.fem.linear.condensation import Condensed, condense, condensed_block_solve
-from dpl.fem.materials.material import Material
-from dpl.fem.rom.iterated_inverse import IteratedInverse
-from dpl.fem.rom.stiffness_interpolation import StiffnessInterpolation
-from dpl.fem.rom.stiffness_iteration import (
-    StiffnessIteration,
-    TermMatrices,
-    count_steps,
+from dpl.fem.linear.condensation import (
+    Condensed,
+    condense,
+    condensed_block_solve,
+    condensed_solves,
 )
+from dpl.fem.linear.krylov import conjugate_gradients
+from dpl.fem.materials.material import Material
+from dpl.fem.rom import stiffness_iteration
+from dpl.fem.rom.stiffness_iteration import StiffnessIteration, TermMatrices, node_body
 from dpl.fem.solvers.condensed_layers import CondensedLayers
 from dpl.fem.solvers.parity_factor import OrbitForm
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import Symmetry
 from dpl.models.precision import full_precision
-from dpl.models.unrolled.compiled import (
-    IterationArrays,
-    LawEntries,
-    LawWeights,
-    LinearPrediction,
-)
 from dpl.scene import Scene
+from dpl.system.threads import on_threads
 
+Array = NDArray[np.float64]
 MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are float32 [-]
-MAX_VALUES = 2**26  # of a batch that are computed at a time
+MAX_VALUES = 2**26  # of a batch that are computed at a time by tensor operations
 
 
 class LinearResponse:
@@ -40,9 +40,11 @@ class LinearResponse:
     K(0) is condensed once into dense blocks, one set for each parity of fields under the
     reflections of the body (`dpl.fem.linear.condensation`). A solution is a sequence of products
     with them, the same for every load: there is no basis that a load on a small area could miss.
-    If the law has ranges, K(0)^-1 is a sum of the inverses for a few parameters
-    (`StiffnessInterpolation`). If K(0) has three or more terms, the inverse for one parameter is
-    the preconditioner of a fixed number of steps of conjugate gradients (`StiffnessIteration`).
+    If K(0) depends on parameters of the law, the blocks of one parameter are the preconditioner of
+    conjugate gradients (`StiffnessIteration`).
+
+    Compiled loops solve on the CPU, one load after the other. Other devices and traced graphs solve
+    batches by tensor operations.
 
     The blocks depend on the scene only and are computed when they are first used.
     """
@@ -54,9 +56,9 @@ class LinearResponse:
             ValueError: K(0) changes too much with the parameters, see `StiffnessIteration`.
         """
         self._scene, self._group = scene, group
-        if self.is_iterated:
-            self.iteration  # noqa: B018  # computed and kept
-        self._on_device: dict[torch.device, _Tensors] = {}
+        self.iteration = StiffnessIteration.of_terms(self.terms)
+        self._orbits_on: dict[torch.device, _Orbits] = {}
+        self._blocks_on: dict[torch.device, _Blocks] = {}
 
     # ------------------------------------------------------------------ blocks
 
@@ -65,71 +67,72 @@ class LinearResponse:
         """Terms of K(0) of the body."""
         return StiffnessTerms.of(self._scene.problem.without_ranged_loads)
 
-    @property
-    def is_iterated(self) -> bool:
-        """True if K(0) has three or more terms, so that each solution takes several steps."""
-        return len(self.terms) > 2
-
-    @cached_property
-    def iteration(self) -> StiffnessIteration:
-        """Parameter for which K(0) is condensed if it has three or more terms."""
-        return StiffnessIteration.of_terms(self.terms)
-
-    @cached_property
-    def interpolation(self) -> StiffnessInterpolation:
-        """Weights of the parameters for which K(0) is condensed if it has one or two terms."""
-        return StiffnessInterpolation.of_terms(self.terms)
-
     @cached_property
     def _form(self) -> OrbitForm:
         return OrbitForm.of(self._scene.problem.reference, self._group)
 
     @cached_property
     def blocks(self) -> Condensed:
-        """Blocks of K nodes and M parities, values (K M, V) in float32.
+        """Blocks of the node, one matrix for each of M parities, values (M, V) in float32.
 
         They are float64 if the solutions of random forces lose more than `MAX_ROUNDING`.
         """
-        bodies = [self._scene.problem.reference]
-        nodes = (self.iteration.node,) if self.is_iterated else self.interpolation.nodes
-        if self.is_iterated or len(nodes) > 1:
-            laws = [self.terms.body(torch.tensor(one).double()).material for one in nodes]
-            bodies = [bodies[0].with_material(law) for law in laws]
-        matrices = [matrix for one in bodies for matrix in self._form.matrices(one)]
+        matrices = self._form.matrices(node_body(self.terms, self.iteration))
         exact = condense(matrices, self._form.points)
         rounded = exact._replace(values=exact.values.astype(np.float32))
         return rounded if _difference(rounded, exact) < MAX_ROUNDING else exact
 
     @cached_property
-    def iterated(self) -> IteratedInverse:
-        """The solutions if K(0) has three or more terms."""
-        matrices = TermMatrices.of(self.terms, self._form)
-        steps = count_steps(self.iteration, self.terms, self._form, self.blocks, matrices)
-        return IteratedInverse(self.blocks, matrices, steps)
+    def _matrices(self) -> TermMatrices:
+        return TermMatrices.of(self.terms, self._form, self.iteration)
 
     @cached_property
     def _supports(self) -> Tensor:
-        return self.terms.support_forces()
+        """Forces of `StiffnessTerms.support_forces` by parity, (T + 1, M m)."""
+        forces = self.terms.support_forces()[:, self._scene.problem.free.cpu()]
+        return torch.stack([self._form.parts(force).flatten() for force in forces])
 
-    def compiled(self) -> LinearPrediction:
-        """Return the linear solution as a part of a compiled prediction."""
-        values = self.blocks.values
-        blocks = values.reshape(-1, len(self._form.parities.members), values.shape[1])
-        found = LinearPrediction(self.blocks.fronts, blocks, self._supports)
-        if not self.is_iterated:
-            return found
-        first_entry, columns, _ = self.iterated.matrices
-        return found._replace(iteration=IterationArrays(first_entry, columns, self.iterated.steps))
+    # ------------------------------------------------------------------ one load
 
-    def law_weights(self, law: Material) -> LawWeights | LawEntries:
-        """Return the numbers of a law that `compiled` needs; its moduli are numbers."""
-        factors = self.terms.factors(law)
-        moduli = np.array([*factors[0].tolist(), 1.0])
-        if self.is_iterated:
-            return LawEntries(moduli, self.iterated.matrices.at(moduli))
-        return LawWeights(self.interpolation.weights(factors)[0].numpy(), moduli)
+    def parts(self, force: Array) -> Array:
+        """Return a force (N, D) by parity, (M, m), see `OrbitForm`."""
+        dofs, scales, characters = self._arrays
+        return characters @ (scales * force.reshape(-1)[dofs])
 
-    # ------------------------------------------------------------------ solution
+    @cached_property
+    def _arrays(self) -> tuple[NDArray[np.int64], Array, Array]:
+        """Degrees of freedom of the orbits and their factors, (M, m), and the characters."""
+        parities, orbits, _ = self._form
+        dofs = self._scene.problem.free.flatten().nonzero()[:, 0].numpy()
+        scales = (orbits.sign * orbits.weight).numpy()
+        return dofs[orbits.images.numpy()], scales, parities.characters.numpy()
+
+    def at(self, law: Material) -> Callable[[Array], Array]:
+        """Return the function from forces to linear solutions, by parity, (M, m) each.
+
+        Args:
+            law: A law of the scene without ranges.
+        """
+        factors = np.append(self.terms.factors(law)[0].numpy(), 1.0)
+        inverse, support = self._inverse(factors), factors @ self._supports.numpy()
+        return lambda parts: inverse(parts.ravel() - support).reshape(parts.shape)
+
+    def _inverse(self, factors: Array) -> Callable[[Array], Array]:
+        """Return the function f (M m,) -> K(0)^-1 f of factors and 1, (T + 1,)."""
+        (table, unknowns, _), values = self.blocks
+
+        def of_node(right: Array) -> Array:
+            forces = right.reshape(len(values), -1).copy()
+            found = np.empty_like(forces)
+            condensed_solves(table, unknowns, values, forces, found)
+            return found.ravel()
+
+        if not self.iteration.varies:
+            return of_node
+        matrix, ends = self._matrices.at(factors), (self.iteration.rtol, self.iteration.max_steps)
+        return lambda f: conjugate_gradients(matrix.dot, of_node, f, *ends, natural=True)
+
+    # ------------------------------------------------------------------ batches
 
     def __call__(self, loaded: Tensor, parameters: Tensor) -> Tensor:
         """Return linear solutions at free degrees of freedom, (B, n).
@@ -138,82 +141,127 @@ class LinearResponse:
             loaded: Forces at free degrees of freedom, (B, n).
             parameters: Parameters of the law, (B, P).
         """
-        count = max(1, MAX_VALUES // (self.blocks.fronts.unknowns.size * len(self.blocks.values)))
-        with full_precision(loaded.device.type):
-            if torch.compiler.is_compiling() or loaded.shape[0] <= count:
-                return self._solve(loaded, parameters)
-            both = zip(loaded.split(count), parameters.split(count), strict=True)
-            return torch.cat([self._solve(*pair) for pair in both])
-
-    def _solve(self, loaded: Tensor, parameters: Tensor) -> Tensor:
-        own = self._tensors(loaded.device)
+        own = self._orbits(loaded.device)
         law = self._scene.problem.material.with_parameters(parameters)
-        factors = self.terms.factors(law).to(loaded).expand(loaded.shape[0], -1)
-        if own.supports is not None:
-            supports = own.supports.to(loaded)
-            loaded = loaded - factors @ supports[:-1] - supports[-1]
-        size = loaded.abs().amax(dim=1, keepdim=True)
-        size = torch.where(size > 0, size, 1.0)  # of order one, so that float32 holds it
-        scaled = (loaded / size).to(own.scales)
-        parts = own.characters @ (own.scales * scaled[:, own.images])  # (B, M, m)
-        solved = self._by_parity(own.layers, parts, factors)
-        values = own.signs * (own.characters.T @ solved)
-        return values.flatten(1)[:, own.places].to(loaded) * size
+        factors = self.terms.factors(law).double().expand(loaded.shape[0], -1)
+        factors = pad(factors, (0, 1), value=1.0)
+        with full_precision(loaded.device.type):
+            parts = own.characters @ (own.scales * loaded.double()[:, own.images])  # (B, M, m)
+            right = parts.flatten(1) - factors @ own.supports
+            if torch.compiler.is_compiling():
+                solved = self.by_tensors(right, factors)
+            else:
+                solved = _Solve.apply(right, factors, self)
+            values = own.signs * (own.characters.T @ solved.view_as(parts))
+        return values.flatten(1)[:, own.places].to(loaded)
 
-    def _by_parity(self, layers: CondensedLayers | None, parts: Tensor, factors: Tensor) -> Tensor:
-        """Return solutions of forces by parity, (B, M, m), for factors (B, T)."""
-        if layers is None:
-            return self.iterated(parts, pad(factors, (0, 1), value=1.0).double())
-        weights = self.interpolation.weights(factors).to(parts)  # (B, K)
-        count = weights.shape[1]
-        solved = layers.solve(parts.transpose(0, 1).repeat(count, 1, 1))  # (K M, B, m)
-        return torch.einsum("kmbj,bk->bmj", solved.unflatten(0, (count, -1)), weights)
+    def solve(self, right: Tensor, factors: Tensor) -> Tensor:
+        """Return K(0)^-1 f, (B, M m), without derivatives.
 
-    def _tensors(self, device: torch.device) -> "_Tensors":
-        if device not in self._on_device:
-            self._on_device[device] = self._make_tensors(device)
-        return self._on_device[device]
+        Args:
+            right: Forces by parity, (B, M m), float64.
+            factors: Factors of the terms, and 1, (B, T + 1), float64.
+        """
+        if right.device.type != "cpu":
+            return self.by_tensors(right, factors)
+        rows = list(zip(right.numpy(), factors.numpy(), strict=True))
+        found = on_threads(lambda row: self._inverse(row[1])(row[0]), rows)
+        return torch.from_numpy(np.stack(found)) if found else torch.empty_like(right)
 
-    def _make_tensors(self, device: torch.device) -> "_Tensors":
-        parities, orbits, _ = self._form
-        layers = None if self.is_iterated else CondensedLayers.of(self.blocks, device)
-        dtype = torch.float64 if layers is None else layers.layers[0].inverse.dtype
-        signs, characters = orbits.sign.to(dtype), parities.characters.to(dtype)
-        free = self._scene.problem.free.cpu()
-        places = torch.empty(int(free.sum()), dtype=torch.int64)
-        places[orbits.images.flatten()] = torch.arange(orbits.images.numel())
-        supports = self._supports[:, free].to(device) if self._supports.any() else None
-        return _Tensors(
-            layers=layers,
-            images=orbits.images.to(device),
-            signs=signs.to(device),
-            scales=(signs * orbits.weight.to(dtype)).to(device),
-            characters=characters.to(device),
-            places=places.to(device),
-            supports=supports,
-        )
+    def by_tensors(self, right: Tensor, factors: Tensor) -> Tensor:
+        """Return the same as `solve` by tensor operations."""
+        own = self._tensors(right.device)
+        count = max(1, MAX_VALUES // max(own.columns.numel(), self.blocks.values.size))
+        if torch.compiler.is_compiling() or right.shape[0] <= count:
+            return self._batch_by_tensors(right, factors)
+        both = zip(right.split(count), factors.split(count), strict=True)
+        return torch.cat([self._batch_by_tensors(*pair) for pair in both])
+
+    def _batch_by_tensors(self, right: Tensor, factors: Tensor) -> Tensor:
+        own = self._tensors(right.device)
+        count, dtype = len(self.blocks.values), own.layers.layers[0].inverse.dtype
+
+        def of_node(f: Tensor) -> Tensor:
+            forces = f.unflatten(1, (count, -1)).transpose(0, 1).to(dtype)
+            return own.layers.solve(forces).transpose(0, 1).flatten(1).double()
+
+        if not self.iteration.varies:
+            size = right.abs().amax(dim=1, keepdim=True)
+            size = torch.where(size > 0, size, 1.0)  # of order one, so that float32 holds it
+            return of_node(right / size) * size
+        matrix = torch.einsum("bk,knw->bnw", factors, own.entries)
+
+        def product(x: Tensor) -> Tensor:
+            return (matrix * x[:, own.columns]).sum(dim=-1)
+
+        ends = self.iteration.rtol, self.iteration.max_steps
+        return stiffness_iteration.conjugate_gradients(product, of_node, right, *ends)
+
+    def products(self, x: Tensor) -> Tensor:
+        """Return the product of each term with x (B, M m), (B, T + 1, M m)."""
+        own = self._tensors(x.device)
+        return torch.einsum("bnw,knw->bkn", x[:, own.columns], own.entries)
+
+    def _orbits(self, device: torch.device) -> "_Orbits":
+        if device not in self._orbits_on:
+            parities, orbits, _ = self._form
+            places = torch.empty(orbits.images.max() + 1, dtype=torch.int64)
+            places[orbits.images.flatten()] = torch.arange(orbits.images.numel())
+            scales = orbits.sign * orbits.weight
+            own = orbits.images, orbits.sign, scales, parities.characters, places, self._supports
+            self._orbits_on[device] = _Orbits(*(part.to(device) for part in own))
+        return self._orbits_on[device]
+
+    def _tensors(self, device: torch.device) -> "_Blocks":
+        if device not in self._blocks_on:
+            columns, entries = torch.zeros(0, dtype=torch.int64), torch.zeros(0)
+            if self.iteration.varies:
+                columns, entries = self._matrices.padded()
+            layers = CondensedLayers.of(self.blocks, device)
+            self._blocks_on[device] = _Blocks(layers, columns.to(device), entries.to(device))
+        return self._blocks_on[device]
 
 
-class _Tensors(NamedTuple):
-    """Tensors of the linear solution on one device.
+class _Orbits(NamedTuple):
+    """Orbits on one device; scales are signs times weights, (M, m); n free degrees of freedom.
 
-    Attributes:
-        layers: Blocks of K(0); None if its solutions are iterated.
-        images, signs: Degrees of freedom of the orbits and their signs, (M, m).
-        scales: Signs times weights of the orbits, (M, m).
-        characters: Factor of each parity under each symmetry, (M, M).
-        places: Position of each free degree of freedom among the images, (n,).
-        supports: See `StiffnessTerms.support_forces`, at free degrees of freedom, (T + 1, n); None
-            if they are zero.
+    `places` (n,) is the position of each degree of freedom among the images.
     """
 
-    layers: CondensedLayers | None
     images: Tensor
     signs: Tensor
     scales: Tensor
     characters: Tensor
     places: Tensor
-    supports: Tensor | None
+    supports: Tensor
+
+
+class _Blocks(NamedTuple):
+    """Blocks of the node and terms of K(0) on one device, see `TermMatrices.padded`."""
+
+    layers: CondensedLayers
+    columns: Tensor
+    entries: Tensor
+
+
+class _Solve(Function):
+    """x = K(0)^-1 f with df = K(0)^-1 dx and da_k = -df K_k x: no step is stored."""
+
+    @staticmethod
+    def forward(ctx: Any, right: Tensor, factors: Tensor, response: LinearResponse) -> Tensor:
+        x = response.solve(right.detach(), factors.detach())
+        ctx.save_for_backward(x, factors)
+        ctx.response = response
+        return x
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor | None, None]:
+        x, factors = ctx.saved_tensors
+        right: Tensor = _Solve.apply(gradients[0], factors, ctx.response)
+        of_factors = None
+        if ctx.needs_input_grad[1] and ctx.response.iteration.varies:
+            of_factors = -torch.einsum("bn,bkn->bk", right, ctx.response.products(x))
+        return right, of_factors, None
 
 
 def _difference(blocks: Condensed, exact: Condensed) -> float:

@@ -1,152 +1,266 @@
-"""Linear solutions of all loads by nested static condensation: compiled, as tensors, in ranges."""
-
-from functools import partial
+"""Linear solutions of all loads and parameters: compiled, as tensors, and their derivatives."""
 
 import pytest
 import torch
 from linear_solutions import BEAM, SUPPORTS, at_free, exact, relative
 
-from dpl import Sample, Scene
-from dpl.fem import (
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Problem,
-    solve,
-    symmetries,
-)
-from dpl.models import Unrolled, linear_response
+from dpl import Sample, Scene, fem
+from dpl.fem import NeoHookeanLn
+from dpl.models import FCNN, LinearBase, Unrolled, linear_response
 from dpl.models.linear_response import LinearResponse
+from dpl.training import RMSELoss, Surrogate
+
+REGIONS = {"core": fem.Box([1.0, 0.2, 0.2], [3.0, 0.8, 0.8])}
+ENDS = [-1.0, 0.7, 1.4, 2.7, 5.0]
+SLICES = {f"part{k}": fem.Box([ENDS[k], -1, -1], [ENDS[k + 1], 2, 2]) for k in range(4)}
+LAWS = {  # law, regions and number of terms
+    "no range": (NeoHookeanLn(0.3), None, 2),
+    "Poisson's ratio": (NeoHookeanLn([0.2, 0.4]), None, 2),
+    "negative ratios": (NeoHookeanLn([-0.3, 0.0]), None, 2),
+    "nearly incompressible": (NeoHookeanLn([0.0, 0.49]), None, 2),
+    "a stiff core": (
+        {"core": NeoHookeanLn(0.3, [1.0, 100.0]), "other": NeoHookeanLn(0.3)},
+        REGIONS,
+        2,
+    ),
+    "a core and Poisson's ratio": (
+        {"core": NeoHookeanLn(0.3, [1.0, 50.0]), "other": NeoHookeanLn([0.2, 0.4], [0.5, 2.0])},
+        REGIONS,
+        3,
+    ),
+    "two regions with all ranges": (
+        {"core": NeoHookeanLn([0.1, 0.4], [1.0, 9.0]), "other": NeoHookeanLn([0.2, 0.45])},
+        REGIONS,
+        4,
+    ),
+    "fibres in an isotropic matrix": (
+        fem.FibreReinforced(
+            fem.NeoHookeanIsoK2([0.3, 0.45], [0.5, 2.0]),
+            fem.Guccione([0.1, 1.0], 8.0, 2.0, 4.0),
+            fem.ConstantFibres([2, 1, 0]),
+        ),
+        None,
+        3,
+    ),
+    "four parts": ({name: NeoHookeanLn(0.3, [1.0, 9.0]) for name in SLICES}, SLICES, 4),
+}
+PLAIN, RANGE, THREE = "no range", "Poisson's ratio", "a core and Poisson's ratio"
+PAIRS = [(name, "held") for name in LAWS]
+PAIRS += [(name, one) for name in (PLAIN, RANGE, THREE) for one in SUPPORTS if one != "held"]
+SIX = [(name, one) for name in (RANGE, THREE) for one in SUPPORTS]
 
 
-@pytest.fixture(params=SUPPORTS, scope="module")
-def supports(request):
-    return SUPPORTS[request.param]
+def scene_of(name=THREE, supports="held", **options):
+    law, regions, _ = LAWS[name]
+    supports = SUPPORTS[supports]
+    body = fem.Problem.build(BEAM, law, regions=regions or {}, supports=supports, **options)
+    newton = fem.Newton(body)
+    return Scene(body, fem.ModalLoads(newton.linear_solver, n_modes=3, deflection=0.1), newton)
 
 
-def scene_of(supports, poisson=0.3, **options):
-    body = Problem.build(BEAM, NeoHookeanLn(poisson), supports=supports, **options)
-    newton = Newton(body)
-    return Scene(body, ModalLoads(newton.linear_solver, n_modes=3, deflection=0.1), newton)
+@pytest.fixture(scope="module", params=PAIRS, ids=", ".join)
+def scene(request):
+    return scene_of(*request.param)
 
 
-def nodal_forces(scene, count=6):
-    """Return forces on single nodes of the boundary, of very different sizes."""
-    force = torch.zeros(count, *scene.problem.shape, dtype=torch.float64)
+@pytest.fixture(scope="module")
+def three():
+    return scene_of()
+
+
+def response_of(scene):
+    return LinearResponse(scene, fem.symmetries(scene.problem))
+
+
+def forces(scene, count=9):
+    """Return noise, forces on single nodes, and modal loads, of very different sizes."""
     random = torch.Generator().manual_seed(0)
-    nodes = scene.loads.loadable_dofs.any(dim=1).nonzero()[:, 0]
-    chosen = nodes[torch.randperm(len(nodes), generator=random)[:count]]
-    for k, node in enumerate(chosen):
-        vector = torch.randn(force.shape[2], generator=random, dtype=torch.float64)
-        force[k, node] = 10.0 ** -(3 * k) * vector
-    return torch.where(scene.problem.free, force, 0.0)
+    force = scene.loads.sample(0, range(count)).force.clone()
+    force[0::3] = torch.randn(force[0::3].shape, generator=random, dtype=torch.float64)
+    nodes = scene.problem.free.all(dim=1).nonzero()[:, 0]
+    for k in range(1, count, 3):
+        node = nodes[torch.randint(len(nodes), (1,), generator=random)]
+        force[k] = 0.0
+        force[k, node] = torch.randn(1, force.shape[2], generator=random, dtype=torch.float64)
+    sizes = 10.0 ** -torch.arange(count, dtype=torch.float64)
+    return torch.where(scene.problem.free, sizes[:, None, None] * force, 0.0)
+
+
+def parameters(scene, count=9):
+    """Return random parameters, and ends of the ranges."""
+    random = torch.Generator().manual_seed(1)
+    ranges = scene.loads.parameter_ranges.values()
+    values = torch.rand(count, len(ranges), generator=random, dtype=torch.float64)
+    values[::2] = values[::2].round()
+    columns = [one.at(t) for one, t in zip(ranges, values.T, strict=True)]
+    return torch.stack(columns, dim=1) if columns else values
 
 
 @pytest.mark.parametrize("group", [True, False], ids=["by parity", "whole"])
-def test_the_linear_solution_of_every_force_is_exact(supports, group):
-    scene = scene_of(supports)
-    response = LinearResponse(scene, symmetries(scene.problem) if group else [])
-    force = nodal_forces(scene)
-    none = force.new_zeros(len(force), 0)
-    found = response(at_free(scene, force), none)
-    assert relative(found, at_free(scene, exact(scene, force, none))) < 1e-5
+def test_the_linear_solution_of_every_force_is_exact_for_all_parameters(scene, group):
+    response = LinearResponse(scene, fem.symmetries(scene.problem) if group else [])
+    force, own = forces(scene), parameters(scene)
+    found = response(at_free(scene, force), own)
+    error = relative(found, at_free(scene, exact(scene, force, own)))
+    assert error < (1e-4 if own.shape[1] else 1e-5)
 
 
-@pytest.mark.parametrize("poisson", [(0.2, 0.4), (-0.3, 0.0), (0.0, 0.49)])
-def test_it_is_exact_for_all_poissons_ratios_of_a_range(supports, poisson):
-    scene = scene_of(supports, poisson)
-    response = LinearResponse(scene, symmetries(scene.problem))
-    force = nodal_forces(scene)
-    ratios = torch.linspace(*poisson, len(force), dtype=torch.float64)[:, None]
-    found = response(at_free(scene, force), ratios)
-    assert relative(found, at_free(scene, exact(scene, force, ratios))) < 2e-4
+def test_the_stiffness_has_the_expected_number_of_terms():
+    counts = {name: len(response_of(scene_of(name)).terms) for name in LAWS}
+    assert counts == {name: count for name, (_, _, count) in LAWS.items()}
 
 
-def test_locking_elements_do_not_change_the_bound_of_ranges():
-    scene = scene_of(SUPPORTS["held"], (0.1, 0.45), mean_dilatation=True)
-    response = LinearResponse(scene, symmetries(scene.problem))
-    force = nodal_forces(scene)
-    ratios = torch.linspace(0.1, 0.45, len(force), dtype=torch.float64)[:, None]
-    found = response(at_free(scene, force), ratios)
-    assert relative(found, at_free(scene, exact(scene, force, ratios))) < 2e-4
+def test_tensor_operations_and_compiled_loops_solve_alike(scene):
+    response = response_of(scene)
+    right = [torch.from_numpy(response.parts(one.numpy())).flatten() for one in forces(scene, 5)]
+    law = scene.problem.material.with_parameters(parameters(scene, 5))
+    factors = response.terms.factors(law).expand(5, -1)
+    pair = torch.stack(right), torch.nn.functional.pad(factors, (0, 1), value=1.0)
+    assert relative(response.solve(*pair), response.by_tensors(*pair)) < 1e-6
 
 
-def test_a_zero_force_has_a_zero_solution():
-    scene = scene_of(SUPPORTS["held"])
-    loaded = torch.zeros(2, int(scene.problem.free.sum()), dtype=torch.float64)
-    assert not LinearResponse(scene, [])(loaded, loaded.new_zeros(2, 0)).any()
+def test_locking_elements_do_not_change_the_bound():
+    scene = scene_of("nearly incompressible", mean_dilatation=True)
+    force, own = forces(scene), parameters(scene)
+    found = response_of(scene)(at_free(scene, force), own)
+    assert relative(found, at_free(scene, exact(scene, force, own))) < 1e-4
 
 
-def test_batches_in_parts_are_like_whole_ones(monkeypatch):
-    scene = scene_of(SUPPORTS["held"])
-    loaded = at_free(scene, nodal_forces(scene))
-    response = LinearResponse(scene, [])
-    whole = response(loaded, loaded.new_zeros(6, 0))
+@pytest.mark.parametrize("name", [PLAIN, THREE])
+def test_a_batch_is_solved_like_its_members(name, monkeypatch):
+    scene = scene_of(name)
+    response = response_of(scene)
+    loaded, own = at_free(scene, forces(scene)), parameters(scene)
+    whole = response(loaded, own)
+    members = [response(loaded[k : k + 1], own[k : k + 1]) for k in range(len(loaded))]
+    assert relative(torch.cat(members), whole) < 1e-12
     monkeypatch.setattr(linear_response, "MAX_VALUES", 1)
-    assert relative(response(loaded, loaded.new_zeros(6, 0)), whole) < 1e-6
+    monkeypatch.setattr(LinearResponse, "solve", LinearResponse.by_tensors)  # as on a GPU
+    assert relative(response(loaded, own), whole) < 1e-6
 
 
 def test_blocks_are_float64_where_float32_is_not_accurate_enough(monkeypatch):
-    scene = scene_of(SUPPORTS["held"])
+    scene = scene_of(PLAIN)
     assert LinearResponse(scene, []).blocks.values.dtype == "float32"
     monkeypatch.setattr(linear_response, "MAX_ROUNDING", 0.0)
     response = LinearResponse(scene, [])
-    force = nodal_forces(scene)
-    none = force.new_zeros(len(force), 0)
+    force, none = forces(scene), parameters(scene)
     found = response(at_free(scene, force), none)
     assert response.blocks.values.dtype == "float64"
     assert relative(found, at_free(scene, exact(scene, force, none))) < 1e-11
 
 
-def test_the_solution_is_differentiable():
+@pytest.mark.parametrize("name", [PLAIN, THREE])
+def test_a_zero_force_has_a_zero_solution_and_a_gradient(name):
+    scene = scene_of(name)
+    loaded = torch.zeros(1, int(scene.problem.free.sum()), dtype=torch.float64, requires_grad=True)
+    found = response_of(scene)(loaded, parameters(scene, 1))
+    assert not found.any()
+    (gradient,) = torch.autograd.grad(found.sum(), loaded)
+    assert gradient.isfinite().all()
+    assert gradient.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "supports"), [(PLAIN, "moved"), (THREE, "held"), (THREE, "moved")]
+)
+def test_gradients_with_respect_to_forces_are_solutions(name, supports):
     """K(0)^-1 is symmetric: the gradient of g u with respect to f is the solution of g."""
-    scene = scene_of(SUPPORTS["moved"])
-    response = LinearResponse(scene, symmetries(scene.problem))
-    force = nodal_forces(scene)
-    loaded = at_free(scene, force).requires_grad_()
-    none = force.new_zeros(len(force), 0)
-    random = torch.Generator().manual_seed(1)
-    weight = torch.randn(loaded.shape, generator=random, dtype=torch.float64)
-    (gradient,) = torch.autograd.grad((weight * response(loaded, none)).sum(), loaded)
-    at_rest = response(torch.zeros_like(weight), none)
-    assert relative(gradient, response(weight, none) - at_rest) < 1e-4
+    scene = scene_of(name, supports)
+    response, own = response_of(scene), parameters(scene)
+    loaded = at_free(scene, forces(scene)).requires_grad_()
+    weight = torch.randn(loaded.shape, generator=torch.Generator().manual_seed(1)).double()
+    (gradient,) = torch.autograd.grad((weight * response(loaded, own)).sum(), loaded)
+    at_rest = response(torch.zeros_like(weight), own)
+    assert relative(gradient, response(weight, own) - at_rest) < 1e-4
+
+
+@pytest.mark.parametrize(("name", "supports"), SIX)
+def test_gradients_with_respect_to_parameters_are_those_of_differences(name, supports):
+    scene = scene_of(name, supports)
+    response = response_of(scene)
+    loaded = at_free(scene, scene.loads.sample(0, range(2)).force)
+    ranges = scene.loads.parameter_ranges.values()
+    own = torch.tensor([[one.at(0.4) for one in ranges], [one.at(0.6) for one in ranges]]).double()
+    own.requires_grad_()
+
+    def work(own):
+        return (response(loaded, own) * loaded).sum()
+
+    (gradient,) = torch.autograd.grad(work(own), own)
+    for k in range(own.shape[1]):
+        step = torch.zeros_like(own)
+        step[:, k] = 1e-2 * own[:, k].detach()
+        with torch.no_grad():
+            expected = (work(own + step) - work(own - step)) / 2
+        assert torch.isclose((gradient * step).sum(), expected, rtol=0.01)
+
+
+def test_images_of_a_load_have_the_images_of_its_solution():
+    scene = scene_of(PLAIN)
+    group, force = fem.symmetries(scene.problem), forces(scene)
+    response, none = response_of(scene), parameters(scene)
+    assert len(group) == 8
+    field = torch.zeros_like(force)
+    field[:, scene.problem.free] = response(at_free(scene, force), none)
+    for symmetry in group:
+        image = response(at_free(scene, symmetry.image(force)), none)
+        assert relative(image, at_free(scene, symmetry.image(field))) < 1e-5
 
 
 def fitted(scene, count=20):
     load = scene.loads.sample(0, range(count))
-    states = solve(scene.solver, load).displacement
+    states = fem.solve(scene.solver, load).displacement
     samples = Sample(load.force, states, load.young, load.parameters)
     net = Unrolled(scene, rank=20, cells=8, stages=1)
     net.fit(samples, samples)
     return net
 
 
-@pytest.mark.parametrize("poisson", [0.3, (0.2, 0.4)], ids=["law", "range"])
-def test_compiled_predictions_of_local_loads_equal_the_tensor_operations(supports, poisson):
-    scene = scene_of(supports, poisson)
-    net = fitted(scene)
-    force = nodal_forces(scene)
-    own = torch.full((6, len(scene.loads.parameter_ranges)), 0.27, dtype=torch.float64)
+@pytest.mark.parametrize(("name", "supports"), [(PLAIN, one) for one in SUPPORTS] + SIX)
+def test_compiled_predictions_equal_the_tensor_operations(name, supports):
+    scene = scene_of(name, supports)
+    net, force, own = fitted(scene), 0.01 * forces(scene), parameters(scene)
+    assert net._is_compiled(force, own)
     compiled = net(force, own)
     tensors = net(force.clone().requires_grad_(), own).detach()
     assert relative(compiled.flatten(1), tensors.flatten(1)) < 1e-5
 
 
-def test_a_small_local_load_has_the_linear_solution():
-    scene = scene_of(SUPPORTS["held"])
-    force = 1e-9 * nodal_forces(scene)
-    expected = exact(scene, force, force.new_zeros(6, 0))
-    assert relative(fitted(scene)(force).flatten(1), expected.flatten(1)) < 1e-4
+@pytest.mark.parametrize("name", [PLAIN, THREE])
+def test_a_small_load_has_the_linear_solution(name):
+    scene = scene_of(name)
+    net, force, own = fitted(scene), 1e-9 * forces(scene), parameters(scene)
+    assert relative(net(force, own).flatten(1), exact(scene, force, own).flatten(1)) < 1e-4
 
 
-def test_images_of_a_load_have_the_images_of_its_solution():
-    scene = scene_of(SUPPORTS["held"])
-    group = symmetries(scene.problem)
-    force = nodal_forces(scene)
-    response = partial(LinearResponse(scene, group), parameters=force.new_zeros(6, 0))
-    assert len(group) == 8
-    for symmetry in group:
-        image = response(at_free(scene, symmetry.image(force)))
-        field = torch.zeros_like(force)
-        field[:, scene.problem.free] = response(at_free(scene, force))
-        assert relative(image, at_free(scene, symmetry.image(field))) < 1e-5
+def test_predictions_are_better_than_the_linear_solution(three):
+    net, load = fitted(three, 40), three.loads.sample(1, range(8))
+    truth = fem.solve(three.solver, load).displacement.flatten(1)
+    linear = next(iter(three.linear.iterate(load))).displacement.flatten(1)
+    found = net(load.force, load.parameters).flatten(1)
+    assert (found - truth).norm(dim=1).median() < 0.5 * (linear - truth).norm(dim=1).median()
+
+
+def test_networks_take_this_linear_solution_as_their_base(three):
+    load = three.loads.sample(0, range(4))
+    expected = next(iter(three.linear.iterate(load))).displacement
+    assert relative(LinearBase(three).solve(load).flatten(1), expected.flatten(1)) < 1e-4
+    torch.manual_seed(0)
+    net = FCNN(three, width=16, base="linear")
+    surrogate = Surrogate(net, RMSELoss(relative=1.0, floor=0.0), three)
+    small = fem.Load(1e-7 * load.force, load.young, load.parameters)
+    with torch.no_grad():
+        found = surrogate.predict(small)
+    assert relative(found.flatten(1), 1e-7 * expected.flatten(1)) < 1e-3
+
+
+@pytest.mark.parametrize("other", [NeoHookeanLn(0.3), NeoHookeanLn([0.2, 0.4])])
+def test_stiffnesses_that_differ_too_much_are_refused_before_any_training(other):
+    laws = {"core": NeoHookeanLn(0.3, [1.0, 1e9]), "other": other}
+    body = fem.Problem.build(BEAM, laws, regions=REGIONS, supports=SUPPORTS["held"])
+    newton = fem.Newton(body)
+    scene = Scene(body, fem.ModalLoads(newton.linear_solver, n_modes=3, deflection=0.1), newton)
+    for build in (Unrolled, LinearBase):
+        with pytest.raises(ValueError, match=r"core.young.* takes more than 200 steps.*base=none"):
+            build(scene)

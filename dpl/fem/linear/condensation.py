@@ -10,8 +10,7 @@ The blocks are stored as they are multiplied, so that a solution consists of pro
 matrices and vectors. A front without forces below it is left out of the forward pass.
 
 Sources: Guyan (1965), AIAA J. 3 (static condensation); George (1973) and Duff, Reid (1983), see
-`dpl.fem.linear.dissection`; Hestenes, Stiefel (1952), J. Res. Natl. Bur. Stand. 49 (conjugate
-gradients, `condensed_iteration`).
+`dpl.fem.linear.dissection`.
 """
 
 from collections.abc import Sequence
@@ -24,8 +23,6 @@ from scipy.sparse import csr_array
 
 from dpl.fem.linear.dissection import Integers, nested_dissection
 from dpl.fem.linear.interface import SingularMatrix
-
-CONVERGED = 1e-6  # energy norm of the error over that of the solution at which iterations stop [-]
 
 
 class Fronts(NamedTuple):
@@ -208,62 +205,25 @@ def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[n
             solution[pivots[i]] = own[i]
 
 
-@njit(nogil=True, cache=True)
-def condensed_iteration(table, unknowns, values, matrix, force, steps, solution):  # type: ignore[no-untyped-def]
-    """Set `solution` (n,) to K^-1 f by conjugate gradients with the blocks of another matrix.
-
-    Return alpha_k (r_k . z_k) of each step for f over its largest entry, (steps,). The sum from
-    step k on is the squared energy norm of the error before this step (Hestenes, Stiefel 1952,
-    theorem 6:1).
+@njit(
+    [
+        void(int64[:, ::1], int64[::1], float32[:, ::1], float64[:, ::1], float64[:, ::1]),
+        void(int64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1]),
+    ],
+    nogil=True,
+    cache=True,
+)
+def condensed_solves(table, unknowns, values, forces, solutions):  # type: ignore[no-untyped-def]
+    """Set `solutions` (P, n) to those of P matrices, one force (P, n) each.
 
     Args:
         table, unknowns: See `Fronts`.
-        values: Blocks of a matrix near K, (V,).
-        matrix: K in CSR: first entry of each row, (n + 1,), columns and entries, (nnz,).
-        force: f, (n,), float64.
-        steps: Largest number of steps; fewer, if the error falls below `CONVERGED`.
-        solution: (n,), float64.
+        values: Blocks of the matrices, (P, V).
+        forces: The forces, float64; overwritten.
+        solutions: (P, n), float64.
     """
-    first_entry, columns, entries = matrix
-    solution[:] = 0.0
-    energies = np.zeros(steps)
-    size = np.abs(force).max()
-    if size == 0.0:
-        return energies
-    residual, work = force / size, np.empty(len(force))
-    z, image = np.empty(len(force)), np.empty(len(force))
-    direction = np.zeros(len(force))
-    before, least = 1.0, 0.0
-    for k in range(steps):
-        work[:] = residual
-        condensed_solve(table, unknowns, values, work, z)
-        rz = dot(residual, z)
-        if k == 0:
-            least = CONVERGED**2 * rz
-        if not rz > least:
-            break
-        for i in range(len(z)):
-            direction[i] = z[i] + rz / before * direction[i]
-        multiply(first_entry, columns, entries, direction, image)
-        length = rz / dot(direction, image)
-        for i in range(len(z)):
-            solution[i] += length * direction[i]
-            residual[i] -= length * image[i]
-        energies[k] = length * rz
-        before = rz
-    for i in range(len(solution)):
-        solution[i] *= size
-    return energies
-
-
-@njit(fastmath=True)
-def multiply(first_entry, columns, entries, x, y):  # type: ignore[no-untyped-def]
-    """Set y (n,) to the product of a matrix in CSR with x (n,)."""
-    for i in range(len(y)):
-        total = 0.0
-        for j in range(first_entry[i], first_entry[i + 1]):
-            total += entries[j] * x[columns[j]]
-        y[i] = total
+    for p in range(len(values)):
+        condensed_solve(table, unknowns, values[p], forces[p], solutions[p])
 
 
 def condensed_block_solve(fronts: Fronts, values: NDArray[Any], x: NDArray[Any]) -> None:

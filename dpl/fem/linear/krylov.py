@@ -42,6 +42,7 @@ def conjugate_gradients(
     max_iter: int,
     *,
     abort_if_slow: bool = False,
+    natural: bool = False,
 ) -> Array:
     """Return x, (n,), with ||right - K x|| <= rtol ||right||.
 
@@ -58,6 +59,7 @@ def conjugate_gradients(
         max_iter: Largest number of iterations.
         abort_if_slow: Stop after three or more iterations if the residual, at its mean rate of
             convergence, would not reach `rtol` within `max_iter`.
+        natural: Take the norm sqrt(r . M^-1 r) instead of the Euclidean norm.
 
     Raises:
         SingularMatrix: K is not positive definite, or `max_iter` is not enough.
@@ -72,6 +74,7 @@ def conjugate_gradients(
     target = rtol * initial
     z = precondition(residual)
     direction, rz = z.copy(), residual @ z
+    least = rtol**2 * rz if natural else 0.0
     for k in range(1, max_iter + 1):
         image = product(direction)
         curvature = direction @ image
@@ -81,12 +84,14 @@ def conjugate_gradients(
         x += length * direction
         residual -= length * image
         norm = np.linalg.norm(residual)
-        if norm <= target:
+        if norm <= target and not natural:
             return unit * x
         if abort_if_slow and k >= 3 and (norm / initial) ** (max_iter / k) > rtol:
             break
         z = precondition(residual)
         rz, before = residual @ z, rz
+        if natural and rz <= least:
+            return unit * x
         direction *= rz / before
         direction += z
     raise SingularMatrix(f"no convergence to {rtol:g} in {max_iter} conjugate gradient steps")

@@ -255,3 +255,12 @@ def whitening(problem: Problem, vectors: Tensor) -> Tensor:
     if failed:
         raise ValueError("V^T K(0) V must be positive definite; fix the rigid body modes")
     return torch.linalg.solve_triangular(lower, torch.eye(len(lower)).double(), upper=False).T
+
+
+def refuse_follower_loads(problem: Problem, name: str) -> None:
+    """Raise a ValueError if the body has follower loads; `name` cannot treat them."""
+    if problem.follower_loads:
+        raise ValueError(
+            f"{name} selects cells and has no {problem.follower_loads.kinds}; use "
+            "dpl.fem.Newton, or a model that predicts nodal displacements (fcnn, cnn, gnn)"
+        )

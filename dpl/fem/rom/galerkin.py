@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.problem import Problem
-from dpl.fem.rom.ecsw import Cubature, cubature
+from dpl.fem.rom.ecsw import Cubature, cubature, refuse_follower_loads
 from dpl.fem.rom.pod import pod
 from dpl.fem.rom.reduced_problem import (
     ReducedLoad,
@@ -20,7 +20,6 @@ from dpl.fem.rom.reduced_problem import (
     beyond_linear,
     broyden,
     norm,
-    refuse_follower_loads,
     refuse_range,
 )
 from dpl.fem.solvers.linear import LinearSolver

@@ -191,15 +191,6 @@ def norm(vector: Tensor) -> float:
     return largest * float(torch.linalg.vector_norm(vector / largest))
 
 
-def refuse_follower_loads(problem: Problem, name: str) -> None:
-    """Raise a ValueError if the body has follower loads; `name` cannot treat them."""
-    if problem.follower_loads:
-        raise ValueError(
-            f"{name} selects cells and has no {problem.follower_loads.kinds}; use "
-            "dpl.fem.Newton, or a model that predicts nodal displacements (fcnn, cnn, gnn)"
-        )
-
-
 def refuse_range(problem: Problem) -> None:
     """Raise a ValueError if the law has ranges."""
     for name, ends in problem.material.parameter_ranges.items():

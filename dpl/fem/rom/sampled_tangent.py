@@ -15,7 +15,7 @@ from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
 from dpl.fem.rom.ecsw import Cubature, whitening
-from dpl.fem.rom.reduced_stiffness import ReducedStiffness
+from dpl.fem.rom.reduced_stiffness import reduced_terms
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 
 Array = NDArray[np.float64]
@@ -121,16 +121,18 @@ class SampledTangent:
         """Return W^T K(0) W, (R, R), of a law of the body."""
         if not self.problem.material.parameter_ranges:
             return self._one
-        return self._stiffness.at(self._terms.factors(law))[0, :, :-1].numpy()
+        factors = np.append(self._terms.factors(law)[0].numpy(), 1.0)
+        return np.tensordot(factors, self._reduced_terms, 1)
 
     @cached_property
     def _one(self) -> Array:
         return np.eye(len(self.scale))
 
     @cached_property
-    def _stiffness(self) -> ReducedStiffness:
+    def _reduced_terms(self) -> Array:
+        """W^T K_k W of the terms of K(0) and of the springs, (T + 1, R, R)."""
         free = self.problem.free.flatten().numpy()
-        return ReducedStiffness.of(self._terms, torch.from_numpy(self._white[free]))
+        return reduced_terms(self._terms, torch.from_numpy(self._white[free]))[..., :-1].numpy()
 
     @cached_property
     def _terms(self) -> StiffnessTerms:

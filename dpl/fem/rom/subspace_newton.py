@@ -14,8 +14,7 @@ from torch import Tensor
 
 from dpl.fem.linear.krylov import scaled_norm
 from dpl.fem.problem import Evaluation, Problem
-from dpl.fem.rom.ecsw import Cubature, cubature
-from dpl.fem.rom.reduced_problem import refuse_follower_loads
+from dpl.fem.rom.ecsw import Cubature, cubature, refuse_follower_loads
 from dpl.fem.rom.sampled_tangent import Array, SampledTangent, Single
 from dpl.fem.solvers.solution import Load, Solution, check_tol, evaluate_solution, run_lockstep
 

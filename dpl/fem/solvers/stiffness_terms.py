@@ -86,24 +86,6 @@ class StiffnessTerms:
         return torch.stack([*forces, constant])
 
     @cached_property
-    def eigenvalues(self) -> tuple[float, float]:
-        """Smallest and largest ratio of the energies of the two terms of any displacement.
-
-        An energy is a sum over points, so that the ratio lies between those of the moduli of the
-        cells, strain by strain.
-        With mean dilatation the bound is approximate for laws with fibres, whose strain has the
-        volume change of the point and not of the cell.
-
-        Raises:
-            ValueError: There are not two terms.
-        """
-        if len(self) != 2:
-            raise ValueError(f"there are {len(self)} terms; this is known for two")
-        A, B = self.cell_moduli
-        ratios = _ratios(A, B)
-        return float(ratios.min()), float(ratios.max())
-
-    @cached_property
     def cell_moduli(self) -> Tensor:
         """Moduli at rest of each term in each cell as quadratic forms of strains, (T, E, 6, 6)."""
         rest = torch.zeros(1, len(self.problem.cells), 1, 3, 3, dtype=torch.float64)
@@ -114,7 +96,9 @@ class StiffnessTerms:
 
         An energy is a sum over points, so that the ratio of two energies of a displacement lies
         between those of the moduli of the cells, strain by strain. Springs have the ratio 1. Of
-        bodies with many different cells, `MAX_CELLS` are taken.
+        bodies with many different cells, `MAX_CELLS` are taken. With mean dilatation the bound is
+        approximate for laws with fibres, whose strain has the volume change of the point and not of
+        the cell.
 
         Args:
             factors: Factors of K(0), (S, T).

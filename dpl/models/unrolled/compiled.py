@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -13,17 +13,13 @@ from torch.nn.functional import pad
 from dpl.fem.assembly.kernels import call_compiled, constants_of
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
-from dpl.fem.linear.condensation import Fronts
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedInverse
 from dpl.fem.symmetry import Symmetry
-from dpl.models.unrolled import iterated_loops
-from dpl.models.unrolled.iterated_loops import IterationArrays, predict_iterated
 from dpl.models.unrolled.loops import (
     SOURCES,
     BasisArrays,
-    LinearArrays,
     MapArrays,
     ModelArrays,
     OrbitArrays,
@@ -42,21 +38,19 @@ class LawArguments(NamedTuple):
     finite: float
 
 
-def law_arguments(law: InvariantBasedMaterial, *, iterated: bool = False) -> LawArguments:
+def law_arguments(law: InvariantBasedMaterial) -> LawArguments:
     """Return a law as the arguments of a compiled loop.
 
     Its constants are followed by mu and lambda, (1, n + 2) or (C, n + 2).
 
     Args:
         law: The law of the sample cells in the order of the loop.
-        iterated: True for the loops of iterated linear solutions.
     """
-    sources = iterated_loops.SOURCES if iterated else SOURCES
     rows = [constants_of(law)[0], *(np.reshape(one, (-1, 1)) for one in (law.mu, law.lam))]
     count = max(map(len, rows))
     constants = np.concatenate([np.broadcast_to(row, (count, row.shape[1])) for row in rows], 1)
     terms = required_terms(law), float(law.finite)
-    return LawArguments(Law.of(law, sources), constants, *terms)
+    return LawArguments(Law.of(law, SOURCES), constants, *terms)
 
 
 @dataclass(frozen=True)
@@ -66,12 +60,10 @@ class CompiledPrediction:
     Attributes:
         arrays: Its matrices.
         cells: Position among the sample cells of each cell of the loops, (C,).
-        iteration: Structure of K(0) if linear solutions are iterated.
     """
 
     arrays: ModelArrays
     cells: Tensor
-    iteration: IterationArrays | None
 
     @classmethod
     def of(
@@ -86,7 +78,6 @@ class CompiledPrediction:
         first_map: Tensor,
         maps: Tensor,
         limits: Tensor,
-        linear: "LinearPrediction",
     ) -> Self:
         """Arrange the matrices by parity.
 
@@ -100,7 +91,6 @@ class CompiledPrediction:
             first_map: B_0, (C D D, R).
             maps: B_1, ..., (K, 2 C D D, R).
             limits: Largest ratio of each correction to the one before, (1 + K,).
-            linear: The linear solution.
         """
         dim = free.shape[1]
         parities = Parities.of(group, dim)
@@ -113,13 +103,11 @@ class CompiledPrediction:
         none = torch.zeros(0, *two.images.shape, of_modes.most)
         others = torch.stack([of_modes.rows(two, matrix) for matrix in maps]) if len(maps) else none
         dofs = free.flatten().nonzero()[:, 0]
-        supports = [fields.by_parity(part[free], parities) for part in linear.supports]
         arrays = ModelArrays(
             orbits=OrbitArrays(
                 characters=parities.characters.numpy(),
                 dofs=_integer(dofs[fields.images]),
                 signs=_double(fields.sign),
-                weights=_double(fields.weight),
             ),
             basis=of_modes.basis(fields, modes),
             maps=MapArrays(
@@ -132,22 +120,16 @@ class CompiledPrediction:
                 others=_single(others),
                 limits=_double(limits),
             ),
-            linear=LinearArrays(
-                table=linear.fronts.table,
-                unknowns=linear.fronts.unknowns,
-                values=linear.values,
-                supports=_double(torch.stack(supports)),
-            ),
         )
         blocks = one.images.unflatten(1, (-1, 9, SIMD_WIDTH))
-        return cls(arrays, blocks[:, :, 0].flatten() // dim**2, linear.iteration)
+        return cls(arrays, blocks[:, :, 0].flatten() // dim**2)
 
     def __call__(
         self,
         law: LawArguments,
         reduced: ReducedInverse,
-        of_law: "LawWeights | LawEntries",
-        force: Array,
+        parts: Array,
+        solution: Array,
         field: Array,
     ) -> None:
         """Set the displacement at free degrees of freedom.
@@ -155,56 +137,11 @@ class CompiledPrediction:
         Args:
             law: The law, see `law_arguments`.
             reduced: (V^T K(0) V)^-1, (R, R), and V^T K(0) p, (R,).
-            of_law: The law as the linear solution needs it.
-            force: Nodal forces, (N, D).
+            parts: Nodal forces by parity, (M, m), see `LinearResponse.parts`.
+            solution: Their linear solution by parity, (M, m); overwritten.
             field: Displacement, (N, D), contiguous.
         """
-        flat = np.ascontiguousarray(force).reshape(-1)
-        data = reduced, of_law, flat, field.reshape(-1)
-        if self.iteration is None:
-            call_compiled(predict, *law, self.arrays, *data)
-        else:
-            call_compiled(predict_iterated, *law, self.arrays, self.iteration, *data)
-
-
-class LinearPrediction(NamedTuple):
-    """The linear solution of a compiled prediction.
-
-    Attributes:
-        fronts: Fronts of K(0).
-        values: Blocks of K nodes, by parity, (K, M, V).
-        supports: See `StiffnessTerms.support_forces`, (T + 1, N, D).
-        iteration: Structure of K(0) if solutions are iterated; then K = 1.
-    """
-
-    fronts: Fronts
-    values: NDArray[Any]
-    supports: Tensor
-    iteration: IterationArrays | None = None
-
-
-class LawWeights(NamedTuple):
-    """A law as an interpolated linear solution needs it.
-
-    Attributes:
-        weights: Weights of the nodes, (K,).
-        moduli: Factors of the terms of K(0), and 1, (T + 1,).
-    """
-
-    weights: Array
-    moduli: Array
-
-
-class LawEntries(NamedTuple):
-    """A law as an iterated linear solution needs it.
-
-    Attributes:
-        moduli: Factors of the terms of K(0), and 1, (T + 1,).
-        entries: Entries of K(0) by parity, (M, nnz).
-    """
-
-    moduli: Array
-    entries: Array
+        call_compiled(predict, *law, self.arrays, reduced, parts, solution, field.reshape(-1))
 
 
 class _ByParity:

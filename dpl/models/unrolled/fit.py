@@ -9,7 +9,7 @@ from torch import Tensor
 from dpl.fem import Problem
 from dpl.fem.materials.material import Material
 from dpl.fem.parity import Parities, SignedOrbits
-from dpl.fem.rom.reduced_stiffness import ReducedStiffness
+from dpl.fem.rom.reduced_stiffness import ReducedStiffness, reduced_terms
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import Symmetry, cell_images
 from dpl.models.invariant_basis import (
@@ -336,7 +336,7 @@ def fit_in_best_modes(
     count = every.shape[1]
     while count:
         modes, symmetry = every[:, :count], (actions[:, :count, :count], parity[:count])
-        stiffness = ReducedStiffness.of(linear.terms, modes).prepared()
+        stiffness = ReducedStiffness(reduced_terms(linear.terms, modes), linear.iteration)
         fitted, held = (
             in_coordinates(linear.terms, modes, stiffness, *pair)
             for pair in zip(both, rests, strict=True)

@@ -7,7 +7,7 @@ operations of `dpl.models.Unrolled`.
 
 import inspect
 import sys
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -17,7 +17,7 @@ from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.lanes import gather_constants, rows
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.linear import condensation
-from dpl.fem.linear.condensation import add_product, condensed_solve, dot
+from dpl.fem.linear.condensation import add_product, dot
 from dpl.models.unrolled import feature_loops
 from dpl.models.unrolled.feature_loops import rotated_strain, unbalanced_stress
 
@@ -45,13 +45,11 @@ class OrbitArrays(NamedTuple):
         characters: Factor of parity p under symmetry g, (M, M).
         dofs: Images of one degree of freedom of each of m orbits, (M, m).
         signs: Factors of these images, (M, m).
-        weights: Factors of the orbits in sums over all degrees of freedom, (m,).
     """
 
     characters: NDArray[np.float64]
     dofs: NDArray[np.int64]
     signs: NDArray[np.float64]
-    weights: NDArray[np.float64]
 
 
 class BasisArrays(NamedTuple):
@@ -93,22 +91,6 @@ class MapArrays(NamedTuple):
     limits: NDArray[np.float64]
 
 
-class LinearArrays(NamedTuple):
-    """The linear solution K(0)^-1 (f - s) by nested static condensation.
-
-    Attributes:
-        table, unknowns: Fronts of m orbits, see `dpl.fem.linear.condensation.Fronts`.
-        values: Blocks of K Poisson's ratios, by parity, (K, M, V).
-        supports: a, b and c, by parity, (3, M, m): s = mu a + lambda b + c is the force of the
-            prescribed displacement.
-    """
-
-    table: NDArray[np.int64]
-    unknowns: NDArray[np.int64]
-    values: NDArray[Any]
-    supports: NDArray[np.float64]
-
-
 class ModelArrays(NamedTuple):
     """Arrays of an unrolled reduced solver.
 
@@ -122,7 +104,6 @@ class ModelArrays(NamedTuple):
     orbits: OrbitArrays
     basis: BasisArrays
     maps: MapArrays
-    linear: LinearArrays
 
 
 @njit(fastmath=True)
@@ -177,21 +158,6 @@ def set_step(model, signs, matrices, features, parts, own, step):
 
 
 @njit
-def force_by_parity(orbits, force):
-    """Return a force (N D,) by parity, (M, m): the products with fields of one orbit."""
-    M, m = orbits.dofs.shape
-    parts = np.zeros((M, m))
-    for g in range(M):
-        for j in range(m):
-            value = force[orbits.dofs[g, j]]
-            if value != 0.0:
-                value *= orbits.signs[g, j] * orbits.weights[j]
-                for p in range(M):
-                    parts[p, j] += orbits.characters[p, g] * value
-    return parts
-
-
-@njit
 def galerkin(basis, inverse, supports, parts):
     """Return the coordinates (R,) of the Galerkin linear solution of a force by parity (M, m)."""
     right = -supports
@@ -209,32 +175,6 @@ def add_modes(basis, coordinates, values):
     for p in range(len(values)):
         of_parity(basis.columns[p], coordinates, own)
         add_product(own, basis.modes[p], values[p])
-
-
-@njit
-def set_linear_solution(linear, weights, moduli, parts, values):
-    """Set values (M, m) to K(0)^-1 (f - s) of a force by parity (M, m).
-
-    Args:
-        linear: The arrays of the linear solution.
-        weights: Factors of the Poisson's ratios, (K,).
-        moduli: Factors of the terms of K(0), and 1, (T + 1,).
-        parts: The force by parity, (M, m).
-        values: The solution.
-    """
-    right, work = np.empty(parts.shape[1]), np.empty(parts.shape[1])
-    solution = np.empty(parts.shape[1])
-    values[:] = 0.0
-    for p in range(len(parts)):
-        right[:] = parts[p]
-        for i in range(len(moduli)):
-            right -= moduli[i] * linear.supports[i, p]
-        if (right != 0.0).any():
-            for k in range(len(weights)):
-                work[:] = right
-                blocks = linear.values[k, p]
-                condensed_solve(linear.table, linear.unknowns, blocks, work, solution)
-                values[p] += weights[k] * solution
 
 
 @njit
@@ -288,21 +228,18 @@ def nonlinear_coordinates(law, c, needs, finite, model, linear):
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def predict(law, c, needs, finite, model, reduced, of_law, force, field):
+def predict(law, c, needs, finite, model, reduced, parts, solution, field):
     """Set the field of a prediction.
 
     Args:
         law, c, needs, finite: The law, see `dpl.models.unrolled.compiled.law_arguments`.
         model: The arrays of the model.
         reduced: (V^T K(0) V)^-1, (R, R), and V^T K(0) p of the prescribed displacement p, (R,).
-        of_law: Weights and moduli of the law, see `set_linear_solution`.
-        force: f, (N D,).
+        parts: The force by parity, (M, m).
+        solution: Its linear solution by parity, (M, m); overwritten.
         field: Displacement at free degrees of freedom, (N D,).
     """
-    parts = force_by_parity(model.orbits, force)
-    values = np.empty(parts.shape)
-    set_linear_solution(model.linear, of_law[0], of_law[1], parts, values)
     linear = galerkin(model.basis, reduced[0], reduced[1], parts)
     found = nonlinear_coordinates(law, c, needs, finite, model, linear)
-    add_modes(model.basis, found, values)
-    set_field(model.orbits, values, field)
+    add_modes(model.basis, found, solution)
+    set_field(model.orbits, solution, field)

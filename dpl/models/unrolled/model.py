@@ -1,5 +1,6 @@
 """Unrolled reduced solver: a few iterations in a subspace whose linear maps are fitted to data."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
@@ -9,21 +10,14 @@ from torch import Tensor
 from dpl.fem import InvariantBasedMaterial, Material, SubspaceNewton, symmetries
 from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.parity import Parities
-from dpl.fem.rom.ecsw import Cubature
-from dpl.fem.rom.reduced_problem import refuse_follower_loads
+from dpl.fem.rom.ecsw import Cubature, refuse_follower_loads
 from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
 from dpl.fem.symmetry import cell_images
 from dpl.models.invariant_basis import orthonormal_fields
 from dpl.models.linear_base import SCALE_STREAM
-from dpl.models.linear_response import LinearResponse
+from dpl.models.linear_response import Array, LinearResponse
 from dpl.models.stored_buffers import StoredBuffers, check_indices
-from dpl.models.unrolled.compiled import (
-    CompiledPrediction,
-    LawArguments,
-    LawEntries,
-    LawWeights,
-    law_arguments,
-)
+from dpl.models.unrolled.compiled import CompiledPrediction, LawArguments, law_arguments
 from dpl.models.unrolled.correction import LOADS, choose_newton, remaining_error
 from dpl.models.unrolled.features import SampleCells
 from dpl.models.unrolled.fit import Maps, cell_positions, fit_in_best_modes
@@ -37,7 +31,7 @@ CELL_STATES = 256  # states at which the cells of a correction are chosen
 MAX_SIZE = 100_000  # of rank, cells and stages
 # buffers and axes with the numbers of modes, cells, maps, and modes and cells of Newton's method
 SIZES = (("modes", 1), ("cells", 0), ("maps", 0), ("newton_modes", 1), ("newton_cells", 0))
-_AtLaw = tuple[LawArguments, ReducedInverse, LawWeights | LawEntries]
+_AtLaw = tuple[LawArguments, ReducedInverse, Callable[[Array], Array]]
 
 
 class Unrolled(StoredBuffers):
@@ -144,7 +138,7 @@ class Unrolled(StoredBuffers):
         self.linear = LinearResponse(scene, self.group)
         for name, (shape, dtype) in self._layout().items():
             self.register_buffer(name, torch.zeros(shape, dtype=dtype))
-        self._stiffness = ReducedStiffness(self.stiffness)
+        self._stiffness = ReducedStiffness(self.stiffness, self.linear.iteration)
         self._compiled: tuple[Tensor, CompiledPrediction] | None = None
         self._law_of_samples = scene.problem.material  # perhaps with ranges
         self._at_last_law: tuple[tuple[Tensor, Any], _AtLaw] | None = None
@@ -207,9 +201,8 @@ class Unrolled(StoredBuffers):
 
     def _prepare(self) -> None:
         """Prepare what a traced graph takes as constants, after the buffers have changed."""
-        iteration = self.linear.iteration if self.linear.is_iterated else None
         parts = self.stiffness.detach().cpu().clone()
-        self._stiffness = ReducedStiffness(parts, iteration).prepared()
+        self._stiffness = ReducedStiffness(parts, self.linear.iteration)
         self._law_of_samples = self.scene.problem.material.of_cells(self.cells.cpu()).centred()
 
     def _at_free_dofs(self, coordinates: Tensor) -> Tensor:
@@ -235,7 +228,9 @@ class Unrolled(StoredBuffers):
 
         def predict_one(k: int) -> None:
             law = material.with_parameters(parameters[k : k + 1])
-            predict(*self._at_law(law), forces[k].numpy(), fields[k].numpy())
+            arguments, reduced, solve = self._at_law(law)
+            parts = self.linear.parts(forces[k].numpy())
+            predict(arguments, reduced, parts, solve(parts), fields[k].numpy())
 
         on_threads(predict_one, range(len(forces)))
         return fields
@@ -251,22 +246,20 @@ class Unrolled(StoredBuffers):
                 self.group,
                 problem.free,
                 positions=positions,
-                linear=self.linear.compiled(),
                 **{name: getattr(self, name) for name in names},
             )
             self._compiled = self.maps, prediction
         return self._compiled[1]
 
     def _at_law(self, law: Material) -> _AtLaw:
-        """Return the law, the reduced body and weights of the linear solution, kept for one law."""
+        """Return the law, the reduced body and the linear solution, kept for one law."""
         last = self._at_last_law  # read once: another thread may replace it
         if last is not None and last[0][0] is self.stiffness and last[0][1] == law:
             return last[1]
         of_cells = one_law(law.of_cells(self.cells[self._prediction.cells]).centred())
         reduced = self._stiffness.inverse(self.linear.terms.factors(law))
         isotropic = cast("InvariantBasedMaterial", of_cells)
-        arguments = law_arguments(isotropic, iterated=self.linear.is_iterated)
-        found = arguments, reduced, self.linear.law_weights(law)
+        found = law_arguments(isotropic), reduced, self.linear.at(law)
         self._at_last_law = (self.stiffness, law), found
         return found
 
@@ -394,6 +387,8 @@ class Unrolled(StoredBuffers):
             if (getattr(self, name) < 0).any():
                 raise ValueError(f"{name} must be 0 or more")
         factors = self.linear.terms.factors(problem.reference.material)
-        matrix = ReducedStiffness(self.stiffness.cpu()).at(factors)[0, :, :-1]
+        matrix = ReducedStiffness(self.stiffness.cpu(), self.linear.iteration).at(factors)[
+            0, :, :-1
+        ]
         if torch.linalg.cholesky_ex(matrix).info:
             raise ValueError("stiffness must be positive definite")
