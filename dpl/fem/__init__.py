@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from dpl.fem.loads.young import YoungRange
     from dpl.fem.materials.cell_field import CellField
     from dpl.fem.materials.demiray import DemirayK2
-    from dpl.fem.materials.fibre_directions import (
+    from dpl.fem.materials.fibres.directions import (
         ConstantFibres,
         FibreData,
         FibreFunction,
         LaplaceFibres,
     )
-    from dpl.fem.materials.fibre_energies import (
+    from dpl.fem.materials.fibres.energies import (
         FibreEnergy,
         Guccione,
         HolzapfelGasserOgdenFibres,
         HolzapfelOgdenFibres,
     )
-    from dpl.fem.materials.fibre_reinforced import FibreDirections, FibreReinforced
+    from dpl.fem.materials.fibres.reinforced import FibreDirections, FibreReinforced
     from dpl.fem.materials.heterogeneous import Heterogeneous
     from dpl.fem.materials.invariant_based import InvariantBasedMaterial
     from dpl.fem.materials.linear_elastic import LinearElastic

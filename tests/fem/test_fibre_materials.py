@@ -27,7 +27,7 @@ from dpl.fem import (
     VolumetricK4,
     box,
 )
-from dpl.fem.materials.fibre_energies import COMPONENTS
+from dpl.fem.materials.fibres.energies import COMPONENTS
 from dpl.fem.materials.tensors import green_lagrange, volume_change
 
 FIBRES = {

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.numba_laws import CompiledLaw, Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
-from dpl.fem.materials.fibre_reinforced import FibreReinforced
+from dpl.fem.materials.fibres.reinforced import FibreReinforced
 
 Array = NDArray[np.float64]
 Gap = Array | tuple[Array, Array]  # of strains, with mean dilatation of strains and volume changes

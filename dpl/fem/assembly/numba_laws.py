@@ -13,8 +13,8 @@ from numba.extending import NativeValue, models, overload, register_model, typeo
 
 from dpl.fem.assembly.simd import load, store
 from dpl.fem.materials import arithmetic
-from dpl.fem.materials.fibre_energies import FibreEnergy
-from dpl.fem.materials.fibre_reinforced import FibreReinforced
+from dpl.fem.materials.fibres.energies import FibreEnergy
+from dpl.fem.materials.fibres.reinforced import FibreReinforced
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 
 CompiledLaw = InvariantBasedMaterial | FibreReinforced

@@ -19,7 +19,7 @@ from scipy.sparse.linalg import cg
 from skfem.models.poisson import laplace
 from torch import Tensor
 
-from dpl.fem.materials.fibre_reinforced import FibreDirections
+from dpl.fem.materials.fibres.reinforced import FibreDirections
 from dpl.fem.mesh.reading import read_cell_data
 from dpl.fem.mesh.regions import Origin, Region, facets_in
 from dpl.fem.mesh.validation import listed

@@ -8,7 +8,7 @@ import skfem
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.fibre_energies import FibreEnergy, LinearFibres, components
+from dpl.fem.materials.fibres.energies import FibreEnergy, LinearFibres, components
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import Material, Response
 from dpl.fem.materials.parameters import Composed
