@@ -28,6 +28,7 @@ from dpl.fem import (
     YeohK2,
     solve,
 )
+from dpl.fem.materials.tensors import green_lagrange
 from dpl.fem.postprocess import RestStiffness
 from dpl.inference import Hybrid
 from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
@@ -112,18 +113,19 @@ def test_a_law_without_ranges_has_no_parameters():
         law.with_parameters(values(0.3))
 
 
-def test_a_batch_of_a_law_without_moduli_as_functions_is_refused_in_words():
+def test_a_batch_of_a_law_that_is_its_energy_has_the_moduli_of_its_members():
     @dataclass(frozen=True)
     class Own(Material):
         ranged = ("stiffness",)
         stiffness: float
 
         def energy(self, H):
-            return self.stiffness * H.square().sum((-2, -1))
+            return self.value("stiffness") * green_lagrange(H).square().sum((-2, -1))
 
     law = Own((1.0, 2.0)).with_parameters(torch.tensor([[1.2], [1.8]]).double())
-    with pytest.raises(ValueError, match="Own: a law with ranges must define mu and lam"):
-        law.mu  # noqa: B018
+    assert law.mu.tolist() == [[[1.2]], [[1.8]]]
+    assert law.lam.tolist() == [[[0.0]], [[0.0]]]
+    assert law.rest_moduli.tolist() == [[1.2, 0.0], [1.8, 0.0]]
 
 
 @pytest.mark.parametrize("law", HOOKEAN)

@@ -15,7 +15,6 @@ from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import Material, Response
 from dpl.fem.materials.parameters import Composed
 from dpl.fem.mesh.regions import Origin, Region, Tag, cells_in
-from dpl.fem.ranges import ParameterRange
 
 OTHER = "other"  # region of the cells that belong to no other region
 
@@ -42,7 +41,6 @@ class Heterogeneous(Composed, Material):
     layout: "Layout | None" = None
 
     def __post_init__(self) -> None:
-        """Check the laws."""
         if not self.laws:
             raise ValueError("material: there is no law; give at least one region a law")
         if len({law.finite for law in self.laws.values()}) > 1:
@@ -54,7 +52,7 @@ class Heterogeneous(Composed, Material):
 
     @property
     def finite(self) -> bool:  # type: ignore[override]
-        """See `Material.finite`."""
+        """False for laws of small strains."""
         return all(law.finite for law in self.laws.values())
 
     # ------------------------------------------------------------------ cells
@@ -93,7 +91,6 @@ class Heterogeneous(Composed, Material):
         return replace(bound, layout=layout)
 
     def of_cells(self, cells: Tensor) -> Self:
-        """See `Material.of_cells`."""
         layout = Layout.of(self.laws.values(), self._layout.law_of_cell[cells])
         return replace(super().of_cells(cells), layout=layout)
 
@@ -104,7 +101,6 @@ class Heterogeneous(Composed, Material):
         return self.layout
 
     def groups(self, count: int) -> list[tuple[Material, Tensor]]:
-        """See `Material.groups`."""
         return self._groups
 
     @cached_property
@@ -120,27 +116,23 @@ class Heterogeneous(Composed, Material):
 
     @property
     def parts(self) -> Mapping[str, Material]:
-        """See `Composed.parts`."""
         return self.laws
 
     def with_parts(self, parts: Mapping[str, Any]) -> Self:
-        """See `Composed.with_parts`."""
         return replace(self, laws=parts)
 
     def identity(self) -> dict[str, Any]:
-        """See `Material.identity`; of the regions, the cells count and not their definition."""
+        """Return laws and cells as plain data; the definition of the regions does not count."""
         laws = {name: law.identity() for name, law in self.laws.items()}
         return {"name": type(self).__name__, "laws": laws, "cells": plain(self._layout.law_of_cell)}
 
     def describe(self) -> str:
-        """See `Material.describe`."""
         return "; ".join(f"{name}: {law.describe()}" for name, law in self.laws.items())
 
     # ------------------------------------------------------------------ evaluation
 
     @property
     def has_response(self) -> bool:
-        """See `Material.has_response`."""
         return all(law.has_response for law in self.laws.values())
 
     def energy(self, H: Tensor) -> Tensor:
@@ -148,11 +140,9 @@ class Heterogeneous(Composed, Material):
         return self._of_all_cells(lambda law, H: law.energy(H), H)
 
     def volumetric_energy(self, j: Tensor) -> Tensor:
-        """See `Material.volumetric_energy`."""
         return self._of_all_cells(lambda law, j: law.volumetric_energy(j), j)
 
     def pressure(self, j: Tensor) -> Tensor:
-        """See `Material.pressure`."""
         return self._of_all_cells(lambda law, j: law.pressure(j), j)
 
     def stress(self, H: Tensor) -> Tensor:
@@ -182,40 +172,26 @@ class Heterogeneous(Composed, Material):
         return torch.cat(parts, dim=1)[:, self._layout.order]
 
     @property
-    def rest_moduli(self) -> Tensor:
-        """See `Material.rest_moduli`; those of the laws one after the other."""
-        parts = [law.rest_moduli for law in self.laws.values()]
-        batch = torch.broadcast_shapes(*(part.shape[:1] for part in parts))
-        return torch.cat([part.expand(*batch, -1) for part in parts], dim=1)
-
-    def linear_law(self, moduli: Tensor) -> "Heterogeneous":
-        """See `Material.linear_law`."""
-        counts = [law.rest_moduli.shape[1] for law in self.laws.values()]
-        parts = zip(self.laws.items(), moduli.split(counts), strict=True)
-        return replace(self, laws={name: law.linear_law(own) for (name, law), own in parts})
-
-    @property
     def largest_poisson_ratio(self) -> float:
-        """See `Material.largest_poisson_ratio`."""
         return max(law.largest_poisson_ratio for law in self.laws.values())
 
     @property
-    def mu(self) -> Tensor:  # type: ignore[override]
+    def mu(self) -> Tensor:
         """Shear modulus at rest over Young's modulus of the cells, (E, 1) or (B, E, 1) [-]."""
         return self._moduli(lambda law: law.mu)
 
     @property
-    def lam(self) -> Tensor:  # type: ignore[override]
+    def lam(self) -> Tensor:
         """First Lame parameter at rest over Young's modulus, (E, 1) or (B, E, 1) [-]."""
         return self._moduli(lambda law: law.lam)
 
     @property
     def point_bulk(self) -> Tensor:
-        """See `Material.point_bulk`, (E, 1) or (B, E, 1) [-]."""
+        """Bulk modulus that stays at the points, (E, 1) or (B, E, 1) [-]."""
         return self._moduli(lambda law: law.point_bulk)
 
-    def _moduli(self, of: Callable[[Material], Any]) -> Tensor:
-        parts = [as_field(of(law), len(cells)) for law, cells in self._groups]
+    def _moduli(self, of: Callable[[Material], Tensor]) -> Tensor:
+        parts = [(of(law), len(cells)) for law, cells in self._groups]
         return join_fields(parts)[..., self._layout.order, :]
 
 
@@ -256,15 +232,13 @@ def one_law(material: Material) -> Material:
     return material
 
 
-def as_field(value: Any, count: int) -> Tensor:
-    """Return a constant as a field of cells, (E, 1), or of a batch, (B, E, 1)."""
-    tensor = torch.as_tensor(value, dtype=torch.float64)
-    tensor = tensor.reshape((1,) * (2 - tensor.ndim) + tensor.shape)
-    return tensor.expand(*tensor.shape[:-2], count, 1)
+def join_fields(parts: Iterable[tuple[Tensor, int]]) -> Tensor:
+    """Return constants of groups of cells as one field of all these cells, (E, 1) or (B, E, 1).
 
-
-def join_fields(fields: Sequence[Tensor]) -> Tensor:
-    """Return fields of groups of cells, (E, 1) or (B, E, 1), as one field of all these cells."""
+    Args:
+        parts: The constant of each group, (), (E, 1), (B, 1, 1) or (B, E, 1), and E.
+    """
+    fields = [value.expand(*value.shape[:-2], count, 1) for value, count in parts]
     batch = torch.broadcast_shapes(*(field.shape[:-2] for field in fields))
     return torch.cat([field.expand(*batch, *field.shape[-2:]) for field in fields], dim=-2)
 
@@ -280,14 +254,11 @@ def merge_laws(laws: Sequence[Material], parts: Sequence[Tensor], order: Tensor)
     laws = [law.of_cells(cells) for law, cells in zip(laws, parts, strict=True)]
     if len(laws) == 1:
         return laws[0]
-    values: dict[str, Any] = {}
-    for name in laws[0].ranged:
-        own = [getattr(law, name) for law in laws]
-        if ranges := [value for value in own if isinstance(value, ParameterRange)]:
-            values[name] = ranges[0]  # such a law has no moduli yet
-        elif any(isinstance(value, Tensor) for value in own) or len(set(own)) > 1:
-            columns = [as_field(v, len(cells)) for v, cells in zip(own, parts, strict=True)]
-            values[name] = join_fields(columns)[..., order, :]
-        else:
-            values[name] = own[0]
+    ranges = {name: ends for law in laws for name, ends in law.parameter_ranges.items()}
+    values: dict[str, Any] = dict(ranges)  # such a law has no moduli yet
+    for name in set(laws[0].ranged) - set(ranges):
+        own = [law.value(name) for law in laws]
+        if not all(value.ndim == 0 and value == own[0] for value in own):
+            fields = join_fields(zip(own, map(len, parts), strict=True))
+            values[name] = fields[..., order, :]
     return replace(cast("Any", laws[0]), **values)

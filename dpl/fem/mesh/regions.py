@@ -32,7 +32,6 @@ class Plane:
     at: float | str
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         _check_axis(self.axis)
         if isinstance(self.at, str) and self.at not in ("min", "max"):
             raise ValueError(f"at = {self.at!r} must be min, max or a coordinate [m]")
@@ -61,7 +60,6 @@ class Box:
     upper: Sequence[float]
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         lower, upper = list(self.lower), list(self.upper)
         if len(lower) != len(upper) or not (np.array(lower) <= upper).all():
             raise ValueError(f"lower = {lower} must not be above upper = {upper}")
@@ -90,7 +88,6 @@ class Sphere:
     radius: float
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         _check_ball(self.centre, self.radius)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -118,7 +115,6 @@ class Cylinder:
     centre: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         _check_axis(self.axis)
         _check_ball(() if self.centre is None else self.centre, self.radius)
 
@@ -144,7 +140,6 @@ class Tag:
     name: str
 
     def __post_init__(self) -> None:
-        """Check the attribute."""
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f'name = {self.name!r} must be a string; write numbers in quotes, "7"')
 
