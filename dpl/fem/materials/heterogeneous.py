@@ -106,10 +106,10 @@ class Heterogeneous(Composed, Material):
     @cached_property
     def _groups(self) -> list[tuple[Material, Tensor]]:
         """Laws that are evaluated together and their cells, in ascending order."""
-        laws = list(self.laws.values())
+        laws, index = list(self.laws.values()), self._layout.law_of_cell
         return [
-            (merge_laws([laws[k] for k in numbers], parts, order), cells)
-            for numbers, parts, order, cells in self._layout.groups
+            (merge_laws([laws[k] for k in numbers], numbers, index, cells), cells)
+            for numbers, cells in self._layout.groups
         ]
 
     # ------------------------------------------------------------------ parameters
@@ -191,8 +191,8 @@ class Heterogeneous(Composed, Material):
         return self._moduli(lambda law: law.point_bulk)
 
     def _moduli(self, of: Callable[[Material], Tensor]) -> Tensor:
-        parts = [(of(law), len(cells)) for law, cells in self._groups]
-        return join_fields(parts)[..., self._layout.order, :]
+        index = self._layout.law_of_cell
+        return values_of_cells([of(law) for law in self.laws.values()], index)
 
 
 class Layout(NamedTuple):
@@ -200,13 +200,12 @@ class Layout(NamedTuple):
 
     Attributes:
         law_of_cell: Number of the law of each cell, (E,).
-        groups: For each group of laws of one class their numbers, the cells of each, the order that
-            sorts these, and all cells of the group in ascending order.
+        groups: For each group of laws of one class their numbers and their cells, both ascending.
         order: Position of each cell in the cells of the groups, (E,).
     """
 
     law_of_cell: Tensor
-    groups: tuple[tuple[list[int], list[Tensor], Tensor, Tensor], ...]
+    groups: tuple[tuple[list[int], Tensor], ...]
     order: Tensor
 
     @classmethod
@@ -217,12 +216,10 @@ class Layout(NamedTuple):
             if (index == k).any():
                 key = type(law) if isinstance(law, InvariantBasedMaterial) else k
                 numbers.setdefault(key, []).append(k)
-        groups = []
-        for own in numbers.values():
-            parts = [(index == k).nonzero()[:, 0] for k in own]
-            order = torch.cat(parts).argsort()
-            groups.append((own, parts, order, torch.cat(parts)[order]))
-        return cls(index, tuple(groups), torch.cat([cells for *_, cells in groups]).argsort())
+        groups = tuple(
+            (own, torch.isin(index, torch.tensor(own)).nonzero()[:, 0]) for own in numbers.values()
+        )
+        return cls(index, groups, torch.cat([cells for _, cells in groups]).argsort())
 
 
 def one_law(material: Material) -> Material:
@@ -232,33 +229,28 @@ def one_law(material: Material) -> Material:
     return material
 
 
-def join_fields(parts: Iterable[tuple[Tensor, int]]) -> Tensor:
-    """Return constants of groups of cells as one field of all these cells, (E, 1) or (B, E, 1).
+def values_of_cells(values: Sequence[Tensor], index: Tensor) -> Tensor:
+    """Return for each cell the value of its law, (E, 1) or (B, E, 1).
 
     Args:
-        parts: The constant of each group, (), (E, 1), (B, 1, 1) or (B, E, 1), and E.
+        values: Constant of each law in all cells, (), (E, 1), (B, 1, 1) or (B, E, 1).
+        index: Number of the law of each cell, (E,).
     """
-    fields = [value.expand(*value.shape[:-2], count, 1) for value, count in parts]
-    batch = torch.broadcast_shapes(*(field.shape[:-2] for field in fields))
-    return torch.cat([field.expand(*batch, *field.shape[-2:]) for field in fields], dim=-2)
+    full = torch.broadcast_tensors(*values, torch.empty(len(index), 1))[:-1]
+    return torch.stack(full, dim=-3)[..., index, torch.arange(len(index)), :]
 
 
-def merge_laws(laws: Sequence[Material], parts: Sequence[Tensor], order: Tensor) -> Material:
-    """Return laws of one class on different cells as one law with fields.
-
-    Args:
-        laws: The laws.
-        parts: Cells of each.
-        order: Order of all these cells in the result.
-    """
-    laws = [law.of_cells(cells) for law, cells in zip(laws, parts, strict=True)]
+def merge_laws(
+    laws: Sequence[Material], numbers: Sequence[int], law_of_cell: Tensor, cells: Tensor
+) -> Material:
+    """Return laws of one class as one law of their cells (C,), whose constants are fields."""
     if len(laws) == 1:
-        return laws[0]
+        return laws[0].of_cells(cells)
     ranges = {name: ends for law in laws for name, ends in law.parameter_ranges.items()}
-    values: dict[str, Any] = dict(ranges)  # such a law has no moduli yet
+    constants: dict[str, Any] = dict(ranges)  # such a law has no moduli yet
+    index = torch.searchsorted(torch.tensor(numbers), law_of_cell.clamp(max=numbers[-1]))
     for name in set(laws[0].ranged) - set(ranges):
         own = [law.value(name) for law in laws]
         if not all(value.ndim == 0 and value == own[0] for value in own):
-            fields = join_fields(zip(own, map(len, parts), strict=True))
-            values[name] = fields[..., order, :]
-    return replace(cast("Any", laws[0]), **values)
+            constants[name] = values_of_cells(own, index)[..., cells, :]
+    return replace(cast("Any", laws[0]), **constants)

@@ -1,8 +1,7 @@
 """Regions of a body, which select nodes and facets for boundary conditions and loads.
 
 A region is a function that maps points (N, D) [m] to a mask (N,), or a `Tag`, the name of a part of
-the mesh. `nodes_in`, `facets_in` and `cells_in`
-take both.
+the mesh. `nodes_in`, `facets_in` and `cells_in` take both.
 """
 
 import math
@@ -23,9 +22,6 @@ class Plane:
     Attributes:
         axis: 0, 1 or 2 for x, y or z.
         at: Coordinate of the plane [m], or "min" or "max" for the extreme nodes of the body.
-
-    Raises:
-        ValueError: `axis` or `at` is invalid.
     """
 
     axis: int
@@ -51,9 +47,6 @@ class Box:
 
     Attributes:
         lower, upper: Opposite corners, D coordinates each [m].
-
-    Raises:
-        ValueError: A coordinate of `lower` is above that of `upper`.
     """
 
     lower: Sequence[float]
@@ -79,9 +72,6 @@ class Sphere:
     Attributes:
         centre: D coordinates [m].
         radius: Radius [m].
-
-    Raises:
-        ValueError: The centre is not finite, or the radius not positive.
     """
 
     centre: Sequence[float]
@@ -105,9 +95,6 @@ class Cylinder:
         axis: 0, 1 or 2 for x, y or z.
         radius: Radius [m].
         centre: A point of the axis, D coordinates [m]; default: the origin.
-
-    Raises:
-        ValueError: `axis` is invalid, the centre not finite or the radius not positive.
     """
 
     axis: int
@@ -132,9 +119,6 @@ class Tag:
     Attributes:
         name: A key of scikit-fem's `mesh.boundaries` (facets) or `mesh.subdomains` (cells). Facets
             take precedence.
-
-    Raises:
-        ValueError: The name is not a string, or empty.
     """
 
     name: str
