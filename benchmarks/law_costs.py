@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from benchmarks.discretisation import BEAM
 from dpl.fem import (
@@ -88,3 +89,41 @@ def law_costs(nodes: Sequence[int] = NODES, *, repeats: int = 5) -> Iterator[Law
 
 def _left_half(points: np.ndarray) -> np.ndarray:
     return np.asarray(points[:, 0] < BEAM[0] / 2)
+
+
+@dataclass(frozen=True)
+class EnergyAlone(Material):
+    """A law that is the energy of another law and nothing else: derivatives are automatic."""
+
+    law: Material
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        return self.law.energy(H)
+
+
+def energy_alone_costs(
+    nodes: Sequence[int] = NODES, *, repeats: int = 5
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return times of residual and of tangent with residual [s] by two forms of one law.
+
+    Each pair holds the median by compiled loops and by the energy alone, on one thread, measured
+    alternately after one evaluation that is not timed.
+
+    Args:
+        nodes: Numbers of nodes along the three sides of the beam.
+        repeats: Number of timed repetitions.
+    """
+    law, mesh = NeoHookeanLn(0.3), box(BEAM, list(nodes))
+    bodies = [Problem.build(mesh, one, fixed=Plane(0, "min")) for one in (law, EnergyAlone(law))]
+    random = torch.Generator().manual_seed(0)
+    u = 1e-4 * torch.randn(1, *bodies[0].shape, generator=random, dtype=torch.float64)
+    rows = []
+    for _ in range(1 + repeats):
+        for call in ("evaluate", "linearise"):
+            for body in bodies:
+                begin = time.perf_counter()
+                getattr(body, call)(u)
+                rows.append(time.perf_counter() - begin)
+    residual, both, *_ = np.median(np.reshape(rows, (-1, 2, 2))[1:], axis=0).tolist()
+    return tuple(residual), tuple(both)

@@ -222,6 +222,8 @@ def laws(cfg: DictConfig, backends: list[str]) -> None:
     CONSOLE.print(table)
     write(rows, Path(cfg.folder) / "law_costs.csv")
     write_machine(Path(cfg.folder) / "law_costs.json")
+    residual, both = (slow / fast for fast, slow in law_costs.energy_alone_costs())
+    CONSOLE.print(f"by the energy alone: residual {residual:.0f}, with tangent {both:.0f} times")
 
 
 def deflections(cfg: DictConfig, backends: list[str]) -> None:

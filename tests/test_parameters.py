@@ -5,29 +5,18 @@ import pickle
 from dataclasses import dataclass, replace
 
 import lightning as L
-import numpy as np
 import pytest
 import torch
 from laws import HOOKEAN
 
-from dpl import DataSetError, Sample
+from dpl import DataSetError, Sample, fem
 from dpl.config import build as run
 from dpl.data import OfflineData, OnlineData, Store
 from dpl.data.storage.integrity import verify
 from dpl.data.storage.shard import decode_shard
 from dpl.evaluation import evaluate
 from dpl.evaluation.report import measure
-from dpl.fem import (
-    DifferentiableSolve,
-    Load,
-    Material,
-    NeoHookeanLn,
-    Newton,
-    PODGalerkin,
-    Problem,
-    YeohK2,
-    solve,
-)
+from dpl.fem.materials.tensors import green_lagrange
 from dpl.fem.postprocess import RestStiffness
 from dpl.inference import Hybrid
 from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
@@ -81,57 +70,27 @@ def member(batch, k):
 # ------------------------------------------------------------------ the law and the body
 
 
-@pytest.mark.parametrize("span", [[0.4, 0.2], [0.3, 0.3], [0.2], [0.1, 0.2, 0.3], [np.nan, 0.2]])
-def test_a_range_that_is_none_is_refused_by_name(span):
-    with pytest.raises(ValueError, match=r"poisson = \[.*must be a range"):
-        NeoHookeanLn(span)
-
-
-@pytest.mark.parametrize(("span", "end"), [([0.2, 0.5], 0.5), ([-1.0, 0.2], -1.0)])
-def test_a_range_whose_end_the_law_refuses_is_refused(span, end):
-    with pytest.raises(ValueError, match=f"poisson = {end} must lie between"):
-        NeoHookeanLn(span)
-
-
-def test_a_law_with_a_range_has_no_moduli_before_it_is_one():
-    law = NeoHookeanLn(SPAN)
-    for moduli in (lambda: law.mu, lambda: law.lam, lambda: law.poisson_ratio):
-        with pytest.raises(ValueError, match=r"poisson = \[0.2, 0.4\] is a range"):
-            moduli()
-    assert law.with_parameters(values(0.25)) == NeoHookeanLn(0.25)
-    with pytest.raises(ValueError, match=r"poisson = 0.5"):
-        law.with_parameters(values(0.5))
-    with pytest.raises(ValueError, match=r"poisson = 0.5"):
-        law.with_parameters(torch.tensor([[0.3], [0.5]]).double())
-
-
-def test_a_law_without_ranges_has_no_parameters():
-    law = YeohK2(0.2, -0.02, 0.005, 2.0)
-    assert law.with_parameters(torch.zeros(1, 0)) is law
-    with pytest.raises(ValueError, match=r"parameters: YeohK2 has ranges of \[\]"):
-        law.with_parameters(values(0.3))
-
-
-def test_a_batch_of_a_law_without_moduli_as_functions_is_refused_in_words():
+def test_a_batch_of_a_law_that_is_its_energy_has_the_moduli_of_its_members():
     @dataclass(frozen=True)
-    class Own(Material):
+    class Own(fem.Material):
         ranged = ("stiffness",)
         stiffness: float
 
         def energy(self, H):
-            return self.stiffness * H.square().sum((-2, -1))
+            return self.value("stiffness") * green_lagrange(H).square().sum((-2, -1))
 
-    law = Own((1.0, 2.0)).with_parameters(torch.tensor([[1.2], [1.8]]).double())
-    with pytest.raises(ValueError, match="Own: a law with ranges must define mu and lam"):
-        law.mu  # noqa: B018
+    law = Own((1.0, 2.0)).with_parameters(torch.tensor([[1.25], [1.75]]).double())
+    assert law.mu.tolist() == [[[1.25]], [[1.75]]]
+    assert law.lam.tolist() == [[[0.0]], [[0.0]]]
+    assert law.rest_moduli.tolist() == [[1.25, 0.0], [1.75, 0.0]]
 
 
-@pytest.mark.parametrize("law", HOOKEAN)
+@pytest.mark.parametrize("law", HOOKEAN[::2])
 def test_a_batch_is_its_members_each_a_body_of_its_own(make_scene, law):
     """By compiled loops and by tensors: forces, energies, rounding."""
     scene = make_scene(law=law, poisson=SPAN)
     load = scene.loads.sample((0, 0), range(3))
-    u = solve(scene.solver, load).displacement
+    u = fem.solve(scene.solver, load).displacement
     body = scene.problem.with_parameters(load.parameters)
     for k in range(3):
         one = make_scene(law=law, poisson=float(load.parameters[k])).problem
@@ -145,14 +104,14 @@ def test_a_batch_is_its_members_each_a_body_of_its_own(make_scene, law):
 
 
 def test_a_law_that_is_its_energy_alone_has_batches_too(make_scene):
-    class Slow(NeoHookeanLn):
-        response = Material.response
-        stress = Material.stress
-        tangent = Material.tangent
+    class Slow(fem.NeoHookeanLn):
+        response = fem.Material.response
+        stress = fem.Material.stress
+        tangent = fem.Material.tangent
 
-    slow, fast = (make_scene(law=law, poisson=SPAN) for law in (Slow, NeoHookeanLn))
+    slow, fast = (make_scene(law=law, poisson=SPAN) for law in (Slow, fem.NeoHookeanLn))
     load = fast.loads.sample((0, 0), range(3))
-    u = solve(fast.solver, load).displacement
+    u = fem.solve(fast.solver, load).displacement
     found = slow.problem.with_parameters(load.parameters).internal_force(u)
     expected = fast.problem.with_parameters(load.parameters).internal_force(u)
     assert torch.allclose(found, expected, rtol=1e-9, atol=1e-15)
@@ -160,12 +119,12 @@ def test_a_law_that_is_its_energy_alone_has_batches_too(make_scene):
 
 def test_nothing_is_compiled_or_analysed_again(wide, monkeypatch):
     loads = wide.loads.sample((0, 0), range(6))
-    solve(wide.solver, Load(*(column[:1] for column in loads)))
+    fem.solve(wide.solver, fem.Load(*(column[:1] for column in loads)))
     monkeypatch.setattr("dpl.fem.assembly.sparsity.Pattern.build", None)
     monkeypatch.setattr("dpl.fem.solvers.linear.make_backend", None)
     monkeypatch.setattr("dpl.fem.problem.Kernels.__init__", None)
     monkeypatch.setattr("dpl.fem.assembly.kernels.Path", None)
-    assert solve(wide.solver, loads).converged.all()
+    assert fem.solve(wide.solver, loads).converged.all()
 
 
 # ------------------------------------------------------------------ truth
@@ -181,25 +140,27 @@ def test_the_truth_of_a_sample_is_that_of_a_body_with_its_poissons_ratio(
     assert SPAN[0] <= float(batch.parameters.min()) < 0.22
     assert 0.38 < float(batch.parameters.max()) <= SPAN[1]
     problem = wide.problem
-    for k in range(5):
-        law = NeoHookeanLn(float(batch.parameters[k]))
-        body = Problem.build(
+    for k in range(2):
+        law = fem.NeoHookeanLn(float(batch.parameters[k]))
+        body = fem.Problem.build(
             problem.mesh.scaled(problem.length),
             law,
             fixed=~problem.free.numpy(),
             mean_dilatation=mean_dilatation,
         )
         load = member(batch, k).load
-        expected = solve(Newton(body, linear="superlu"), Load(load.force, load.young)).displacement
+        expected = fem.solve(
+            fem.Newton(body, linear="superlu"), fem.Load(load.force, load.young)
+        ).displacement
         found = batch.displacement[k]
         if mean_dilatation:
-            whole = Problem.build(
+            whole = fem.Problem.build(
                 problem.mesh.scaled(problem.length),
                 problem.material,
                 fixed=~problem.free.numpy(),
                 mean_dilatation=True,
             )
-            found = solve(Newton(whole, linear="superlu"), load).displacement[0]
+            found = fem.solve(fem.Newton(whole, linear="superlu"), load).displacement[0]
         assert (found - expected[0]).norm() < 1e-10 * expected.norm()
 
 
@@ -214,8 +175,8 @@ def test_poissons_ratio_is_a_function_of_stream_and_index_and_moves_no_other_num
 def test_every_solver_takes_each_load_with_its_own(wide, few):
     exact = few.displacement
     for solver in (wide.solver, Hybrid(lambda load: 0 * load.force, wide.solver)):
-        assert torch.allclose(solve(solver, few.load).displacement, exact, rtol=0, atol=1e-9)
-    linear = solve(wide.linear, few.load).displacement
+        assert torch.allclose(fem.solve(solver, few.load).displacement, exact, rtol=0, atol=1e-9)
+    linear = fem.solve(wide.linear, few.load).displacement
     for k in range(4):
         one = wide.linear.with_parameters(few.parameters[k, None]).solve(few.force[k])
         assert torch.equal(linear[k], one)
@@ -223,12 +184,12 @@ def test_every_solver_takes_each_load_with_its_own(wide, few):
 
 
 def test_a_load_that_does_not_say_which_is_refused(wide, few):
-    silent = Load(few.force, few.young)
+    silent = fem.Load(few.force, few.young)
     for solver in (wide.solver, wide.linear):
         with pytest.raises(
             ValueError, match=r"has 0 parameters and the body has ranges of \['poisson'\]"
         ):
-            solve(solver, silent)
+            fem.solve(solver, silent)
     with pytest.raises(
         ValueError, match=r"Load.parameters has 0 columns; the body has ranges of \['poisson'\]"
     ):
@@ -244,24 +205,24 @@ def test_a_scene_of_one_refuses_to_predict_for_another(scene, few):
 
 def test_a_reduced_basis_refuses_a_range(wide, few):
     with pytest.raises(ValueError, match=r"poisson = .* must be one number"):
-        PODGalerkin.fit(wide.problem, few.displacement, 2)
+        fem.PODGalerkin.fit(wide.problem, few.displacement, 2)
 
 
 def test_gradients_of_exact_answers_are_those_of_the_body_of_each_load(wide, few, make_scene):
     force = few.force.clone().requires_grad_()
-    DifferentiableSolve(wide.solver)(
-        Load(force, few.young, few.parameters)
+    fem.DifferentiableSolve(wide.solver)(
+        fem.Load(force, few.young, few.parameters)
     ).square().sum().backward()
     one = make_scene(poisson=float(few.parameters[1]))
     alone = few.force[1:2].clone().requires_grad_()
-    DifferentiableSolve(one.solver)(Load(alone, few.young[1:2])).square().sum().backward()
+    fem.DifferentiableSolve(one.solver)(fem.Load(alone, few.young[1:2])).square().sum().backward()
     assert torch.allclose(force.grad[1], alone.grad[0], rtol=1e-6, atol=1e-12)
 
 
 def test_exact_answers_are_differentiable_in_the_parameters(wide, few):
-    exact, step = DifferentiableSolve(replace(wide.solver, tol=1e-12)), 1e-5
+    exact, step = fem.DifferentiableSolve(replace(wide.solver, tol=1e-12)), 1e-5
     for count in (1, 3):
-        load = Load(few.force[:count], few.young[:count], few.parameters[:count])
+        load = fem.Load(few.force[:count], few.young[:count], few.parameters[:count])
 
         def size(parameters, load=load):
             return exact(load._replace(parameters=parameters)).square().sum(dim=(1, 2))
@@ -406,7 +367,9 @@ def median_error(module, test):
 
 def by_poisson(module, sample, span=SPAN):
     """Return the displacements of one load at both ends of the range."""
-    load = Load(sample.force.repeat(2, 1, 1), sample.young.repeat(2), torch.tensor(span).double())
+    load = fem.Load(
+        sample.force.repeat(2, 1, 1), sample.young.repeat(2), torch.tensor(span).double()
+    )
     with torch.no_grad():
         return module.predict(load)
 
@@ -446,7 +409,7 @@ def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, f
     net.fit(sets.samples("train"), sets.samples("val"))
     module = Surrogate(net, MSE(), wide).eval()
     light = few._replace(force=1e-4 * few.force)
-    exact = solve(wide.linear, light.load).displacement
+    exact = fem.solve(wide.linear, light.load).displacement
     with torch.no_grad():
         found = module.predict(light.load)
     reference = torch.stack([wide.linear.reference.solve(force) for force in light.force])
@@ -511,7 +474,7 @@ def test_a_solver_with_ranges_is_fitted_and_evaluated(wide, sets, tmp_path, monk
     trainer.fit(module, datamodule=sets)
     module.eval()
     test = sets.samples("test")
-    linear = solve(wide.linear, test.load).displacement
+    linear = fem.solve(wide.linear, test.load).displacement
     reported = median_error(module, test)
     assert reported < float(RelativeL2().measure(linear, test).median()) / 2
     assert reported < median_error(module, test._replace(parameters=0 * test.parameters + 0.3)) / 2

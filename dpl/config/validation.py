@@ -84,9 +84,9 @@ CLASSES_OF_DATA = {  # base class of `data`, by a key of the commands that need 
 }
 PARTS = {  # base classes of the objects that a call in the file of a run may contain
     *EXPECTED_TYPES["mesh"] | EXPECTED_TYPES["material"] | EXPECTED_TYPES["loads"] | REGIONS,
-    "dpl.fem.materials.cell_field.CellField",
-    "dpl.fem.materials.fibre_energies.FibreEnergy",
-    "dpl.fem.materials.fibre_reinforced.FibreDirections",
+    "dpl.fem.materials.parameters.CellField",
+    "dpl.fem.materials.fibres.energies.FibreEnergy",
+    "dpl.fem.materials.fibres.reinforced.FibreDirections",
     "dpl.training.losses.loss.Loss",
     "lightning.fabric.plugins.io.checkpoint_io.CheckpointIO",
     "numpy.ndarray",

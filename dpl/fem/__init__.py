@@ -19,26 +19,24 @@ if TYPE_CHECKING:
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
     from dpl.fem.loads.patch import PatchLoads
     from dpl.fem.loads.point import PointLoads
-    from dpl.fem.materials.cell_field import CellField
-    from dpl.fem.materials.demiray import DemirayK2
-    from dpl.fem.materials.fibre_directions import (
+    from dpl.fem.materials.fibres.directions import (
         ConstantFibres,
         FibreData,
         FibreFunction,
         LaplaceFibres,
     )
-    from dpl.fem.materials.fibre_energies import (
+    from dpl.fem.materials.fibres.energies import (
         FibreEnergy,
         Guccione,
         HolzapfelGasserOgdenFibres,
         HolzapfelOgdenFibres,
     )
-    from dpl.fem.materials.fibre_reinforced import FibreDirections, FibreReinforced
+    from dpl.fem.materials.fibres.reinforced import FibreDirections, FibreReinforced
     from dpl.fem.materials.heterogeneous import Heterogeneous
     from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-    from dpl.fem.materials.linear_elastic import LinearElastic
+    from dpl.fem.materials.isochoric import DemirayK2, MooneyRivlinK2, YeohK2
+    from dpl.fem.materials.linear_elastic import LinearElastic, SaintVenantKirchhoff
     from dpl.fem.materials.material import Material, YoungPoissonMaterial
-    from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
     from dpl.fem.materials.neo_hookean import (
         NeoHookeanIsoK2,
         NeoHookeanIsoK4,
@@ -46,9 +44,8 @@ if TYPE_CHECKING:
         StableNeoHookean,
     )
     from dpl.fem.materials.ogden import OgdenK2
-    from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+    from dpl.fem.materials.parameters import CellField
     from dpl.fem.materials.volumetric import VolumetricK2, VolumetricK4
-    from dpl.fem.materials.yeoh import YeohK2
     from dpl.fem.mesh.finger_mesh import finger
     from dpl.fem.mesh.generators import box, rectangle
     from dpl.fem.mesh.propeller_mesh import propeller

@@ -16,7 +16,6 @@ from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients
 from dpl.fem.assembly.follower_loads import FollowerLoad, FollowerLoads
 from dpl.fem.assembly.kernels import GroupedKernels, Kernels
 from dpl.fem.assembly.mean_dilatation import CellVolumes, MixedGap, volume_gap
-from dpl.fem.assembly.numba_laws import CompiledLaw
 from dpl.fem.assembly.variants import BodyVariants
 from dpl.fem.materials.heterogeneous import Heterogeneous
 from dpl.fem.materials.material import Material
@@ -317,7 +316,7 @@ class Problem(BodyVariants):
     @cached_property
     def _compiled(self) -> Kernels | GroupedKernels | None:
         groups = self.material.groups(len(self.cells))
-        laws = [law for law, _ in groups if isinstance(law, CompiledLaw)]
+        laws = [law for law, _ in groups if law.compiled_form is not None]
         if len(laws) < len(groups):
             return None
         first = self.__dict__.get("_first", self).reference

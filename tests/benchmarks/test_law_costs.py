@@ -10,4 +10,5 @@ def test_each_body_has_its_time(tmp_path):
     assert rows[0].ratio == 1
     assert all(row.ms > 0 < row.ratio and row.dofs == 3 * 5 * 9 for row in rows)
     write(rows, tmp_path / "laws.csv")
+    assert all(time > 0 for pair in law_costs.energy_alone_costs((5, 3, 3)) for time in pair)
     assert read(law_costs.LawCost, tmp_path / "laws.csv")[1].body == rows[1].body

@@ -128,14 +128,14 @@ def test_resultant_and_moment_are_zero(active):
 def test_a_free_block_shortens_as_the_closed_form(cell, tension, grid):
     """P_11 = 0 and P_22 = 0 give the two stretches; plane strain in 2D."""
     mesh = grid(cell, 2, 0.15, inside=True)
-    dim = mesh.dim()
+    dim, mu, lam = mesh.dim(), float(NH.mu), float(NH.lam)
 
     def stresses(stretches):
         a, b = stretches
-        change = NH.lam * math.log(a * b ** (dim - 1))
+        change = lam * math.log(a * b ** (dim - 1))
         return (
-            NH.mu * (a - 1 / a) + change / a + tension * a,
-            NH.mu * (b - 1 / b) + change / b,
+            mu * (a - 1 / a) + change / a + tension * a,
+            mu * (b - 1 / b) + change / b,
         )
 
     a, b = fsolve(stresses, [0.9, 1.05], xtol=1e-14)

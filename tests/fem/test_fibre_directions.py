@@ -10,22 +10,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from dpl.fem import (
-    ConstantFibres,
-    FibreData,
-    FibreFunction,
-    FibreReinforced,
-    Guccione,
-    LaplaceFibres,
-    NeoHookeanLn,
-    Problem,
-    Tag,
-    VolumetricK2,
-    box,
-    read_cell_data,
-    read_mesh,
-    rectangle,
-)
+from dpl import fem
 from dpl.fem.assembly.elements import basis_of
 
 INNER, OUTER = 1.0, 2.0  # radii of the cylinder [m]
@@ -34,7 +19,7 @@ INNER_ANGLE, OUTER_ANGLE = 1.0, -0.8  # [rad]
 
 def frames_on(spec, mesh: skfem.Mesh, degree: int = 1) -> Tensor:
     """Return the frames (n, 3, 3) of the body that `Problem.build` makes of a mesh [m]."""
-    body = Problem.build(mesh, NeoHookeanLn(0.3), degree=degree)
+    body = fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), degree=degree)
     frames = spec.on(body.basis, body.length, body.origin)
     assert frames.dtype == torch.float64
     eye = torch.eye(3, dtype=torch.float64)
@@ -54,7 +39,7 @@ def quarter_cylinder(
 ) -> skfem.Mesh:
     """Return a quarter of a thick cylinder along z, with `count` cells through the wall."""
     flat = cell in ("quad", "triangle")
-    make, nodes = (rectangle, []) if flat else (box, [3])
+    make, nodes = (fem.rectangle, []) if flat else (fem.box, [3])
     mesh = make([1.0] * (3 - flat), [count + 1, 3 * count + 1, *nodes], cell)
     if curved:
         mesh = {"tetra": skfem.MeshTet2, "hexahedron": skfem.MeshHex2}[cell].from_mesh(mesh)
@@ -78,15 +63,15 @@ def polar(mesh: skfem.Mesh, degree: int = 1) -> tuple[np.ndarray, np.ndarray, np
     return radius, radial, np.cross([0.0, 0.0, 1.0], radial)
 
 
-def wall(**other) -> LaplaceFibres:
+def wall(**other) -> fem.LaplaceFibres:
     options = {
-        "inner": Tag("inner"),
-        "outer": Tag("outer"),
+        "inner": fem.Tag("inner"),
+        "outer": fem.Tag("outer"),
         "longitudinal": [0.0, 0.0, 2.0],
         "inner_angle": INNER_ANGLE,
         "outer_angle": OUTER_ANGLE,
     }
-    return LaplaceFibres(**(options | other))
+    return fem.LaplaceFibres(**(options | other))
 
 
 def errors(mesh: skfem.Mesh, degree: int = 1) -> tuple[float, float]:
@@ -105,18 +90,20 @@ def errors(mesh: skfem.Mesh, degree: int = 1) -> tuple[float, float]:
 @pytest.mark.parametrize(
     ("spec", "wanted"),
     [
-        (ConstantFibres([2.0, 0.0, 0.0]), [[1, 0, 0], [0, 1, 0], [0, 0, 1]]),
-        (ConstantFibres([0.0, 3.0, 0.0]), [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
-        (ConstantFibres([0.0, 0.0, 1e-200]), [[0, 0, 1], [1, 0, 0], [0, 1, 0]]),
-        (ConstantFibres([1, 0, 0], [1, 0, 1e-3]), [[1, 0, 0], [0, 0, 1], [0, -1, 0]]),
-        (ConstantFibres([3.0, 4.0]), [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]]),
+        (fem.ConstantFibres([2.0, 0.0, 0.0]), [[1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+        (fem.ConstantFibres([0.0, 3.0, 0.0]), [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+        (fem.ConstantFibres([0.0, 0.0, 1e-200]), [[0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+        (fem.ConstantFibres([1, 0, 0], [1, 0, 1e-3]), [[1, 0, 0], [0, 0, 1], [0, -1, 0]]),
+        (fem.ConstantFibres([3.0, 4.0]), [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]]),
     ],
 )
 def test_constant_fibres_are_orthonormalised(spec, wanted):
     """Columns f, s, n; the default sheet is z x f, or x where f lies along z."""
     frame = spec.constant()
     assert_close(frame[0].mT, torch.tensor(wanted, dtype=torch.float64), rtol=0, atol=1e-12)
-    mesh = rectangle([1.0, 1.0], [3, 3]) if len(spec.fibre) == 2 else box([1.0] * 3, [2, 2, 2])
+    mesh = (
+        fem.rectangle([1.0, 1.0], [3, 3]) if len(spec.fibre) == 2 else fem.box([1.0] * 3, [2, 2, 2])
+    )
     assert_close(frames_on(spec, mesh), frame, rtol=0, atol=0)
 
 
@@ -124,14 +111,14 @@ def test_constant_fibres_are_orthonormalised(spec, wanted):
 @pytest.mark.parametrize("degree", [1, 2])
 def test_functions_take_the_coordinates_of_the_user(cell, degree):
     """In metres, far from the origin."""
-    mesh = box([2.0, 1.0, 1.0], [3, 3, 3], cell).scaled(5.0).translated([1e4, -20.0, 0.0])
+    mesh = fem.box([2.0, 1.0, 1.0], [3, 3, 3], cell).scaled(5.0).translated([1e4, -20.0, 0.0])
     points = []
 
     def directions(x):
         points.append(x)
         return np.stack([x[:, 0] - 1e4, x[:, 1], 0 * x[:, 0]], axis=1)
 
-    frames = frames_on(FibreFunction(directions), mesh, degree)
+    frames = frames_on(fem.FibreFunction(directions), mesh, degree)
     places = points_of(mesh, degree)
     np.testing.assert_allclose(points[0], places, rtol=0, atol=1e-9)
     wanted = directions(places)
@@ -141,8 +128,8 @@ def test_functions_take_the_coordinates_of_the_user(cell, degree):
 
 
 def test_function_may_return_sheets_too():
-    spec = FibreFunction(lambda x: (np.ones_like(x), x * [1.0, -1.0, 0.0]))
-    mesh = box([1.0] * 3, [3, 3, 3])
+    spec = fem.FibreFunction(lambda x: (np.ones_like(x), x * [1.0, -1.0, 0.0]))
+    mesh = fem.box([1.0] * 3, [3, 3, 3])
     frames = frames_on(spec, mesh)
     assert_close(frames[:, :, 0], torch.full((8 * 8, 3), 3**-0.5).double())
     sheet = points_of(mesh) * [1.0, -1.0, 0.0]
@@ -152,21 +139,21 @@ def test_function_may_return_sheets_too():
 
 
 def test_data_are_arrays_with_a_row_for_each_cell():
-    mesh = rectangle([1.0, 1.0], [4, 3])
+    mesh = fem.rectangle([1.0, 1.0], [4, 3])
     rows = np.random.default_rng(0).normal(size=(6, 2))
-    frames = frames_on(FibreData(rows), mesh)
+    frames = frames_on(fem.FibreData(rows), mesh)
     unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     np.testing.assert_allclose(frames[:, :2, 0], unit, atol=1e-14)
-    assert_close(frames, frames_on(FibreData(rows.tolist()), mesh))
+    assert_close(frames, frames_on(fem.FibreData(rows.tolist()), mesh))
     for wrong in (rows[:5], rows[0], np.zeros((6, 4))):
         with pytest.raises(ValueError, match=r"fibre of shape .* must have \(6, 2\)"):
-            frames_on(FibreData(wrong), mesh)
+            frames_on(fem.FibreData(wrong), mesh)
 
 
 @pytest.mark.filterwarnings("ignore:.*inside out")
 def test_data_may_be_named_fields_of_a_mesh_file(tmp_path):
     """The rows are those of the cells that are kept, in their order."""
-    made = box([1.0, 1.0, 1.0], [3, 3, 2], "tetra")
+    made = fem.box([1.0, 1.0, 1.0], [3, 3, 2], "tetra")
     rows = np.random.default_rng(0).normal(size=(2, made.t.shape[1], 3))
     file = str(tmp_path / "body.vtu")
     halves = made.t.T[:7], made.facets.T[:2], made.t.T[7:]
@@ -178,21 +165,21 @@ def test_data_may_be_named_fields_of_a_mesh_file(tmp_path):
             for name, data in zip(("fibres", "sheets"), rows, strict=True)
         },
     ).write(file)
-    mesh = read_mesh(file)
+    mesh = fem.read_mesh(file)
     np.testing.assert_allclose(mesh.p[:, mesh.t].mean(1), made.p[:, made.t].mean(1))
-    found = frames_on(FibreData("fibres", "sheets", file), mesh)
-    assert_close(found, frames_on(FibreData(*rows), mesh), rtol=0, atol=0)
-    np.testing.assert_array_equal(read_cell_data(file, ["sheets"])[0], rows[1])
+    found = frames_on(fem.FibreData("fibres", "sheets", file), mesh)
+    assert_close(found, frames_on(fem.FibreData(*rows), mesh), rtol=0, atol=0)
+    np.testing.assert_array_equal(fem.read_cell_data(file, ["sheets"])[0], rows[1])
     with pytest.raises(ValueError, match=r"body.vtu: has no cell data 'nothing'; .*'fibres'"):
-        frames_on(FibreData("nothing", file=file), mesh)
+        frames_on(fem.FibreData("nothing", file=file), mesh)
     with pytest.raises(FileNotFoundError):
-        frames_on(FibreData("fibres", file=str(tmp_path / "none.vtu")), mesh)
+        frames_on(fem.FibreData("fibres", file=str(tmp_path / "none.vtu")), mesh)
 
 
 def test_law_takes_the_frames_of_its_directions():
-    law = FibreReinforced(VolumetricK2(2.0), Guccione(0.2, 8, 2, 4), wall())
+    law = fem.FibreReinforced(fem.VolumetricK2(2.0), fem.Guccione(0.2, 8, 2, 4), wall())
     mesh = quarter_cylinder(2)
-    body = Problem.build(mesh, NeoHookeanLn(0.3))
+    body = fem.Problem.build(mesh, fem.NeoHookeanLn(0.3))
     known = law.on(body.basis, body.length, body.origin)
     assert_close(known.frames.flatten(0, 1), frames_on(wall(), mesh), rtol=0, atol=0)
     assert known.on(body.basis, body.length, body.origin) is known
@@ -258,15 +245,15 @@ def test_angle_is_zero_for_circumferential_fibres():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: ConstantFibres([0.0, 0.0, 0.0]), "fibre must be finite and not zero"),
-        (lambda: ConstantFibres([math.inf, 0.0, 0.0]), "fibre must be finite and not zero"),
-        (lambda: ConstantFibres([1.0]), "fibre = .* must have 2 or 3 components"),
-        (lambda: ConstantFibres([1.0, 0, 0], [0, 0, 0]), "sheet must be finite and not zero"),
-        (lambda: ConstantFibres([1.0, 1, 0], [2, 2, 0]), "sheet must not be parallel to fibre"),
+        (lambda: fem.ConstantFibres([0.0, 0.0, 0.0]), "fibre must be finite and not zero"),
+        (lambda: fem.ConstantFibres([math.inf, 0.0, 0.0]), "fibre must be finite and not zero"),
+        (lambda: fem.ConstantFibres([1.0]), "fibre = .* must have 2 or 3 components"),
+        (lambda: fem.ConstantFibres([1.0, 0, 0], [0, 0, 0]), "sheet must be finite and not zero"),
+        (lambda: fem.ConstantFibres([1.0, 1, 0], [2, 2, 0]), "sheet must not be parallel to fibre"),
         (lambda: wall(longitudinal=[0, 0, 0]), "longitudinal must be finite and not zero"),
         (lambda: wall(inner_angle=math.nan), "inner_angle = nan must be a finite number"),
-        (lambda: FibreData("fibres"), "fibre must be the name of cell data if there is a file"),
-        (lambda: FibreData("f", [[1.0, 0]], "a.vtu"), "sheet must be the name of cell data"),
+        (lambda: fem.FibreData("fibres"), "fibre must be the name of cell data if there is a file"),
+        (lambda: fem.FibreData("f", [[1.0, 0]], "a.vtu"), "sheet must be the name of cell data"),
     ],
 )
 def test_invalid_directions_are_an_error(build, message):
@@ -277,12 +264,12 @@ def test_invalid_directions_are_an_error(build, message):
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        (ConstantFibres([1.0, 0.0]), "must have 3 components"),
-        (FibreFunction(lambda x: x[:2]), r"fibre of shape \(2, 3\)"),
-        (FibreFunction(lambda x: (x, x)), r"sheet must not be parallel to fibre \(cells 0, 1"),
-        (FibreFunction(lambda x: 0 * x), r"fibre must be finite and not zero \(cells 0, 1"),
-        (wall(outer=Tag("inner")), "inner and outer must not touch"),
-        (wall(outer=Tag("nothing")), "the mesh has 'inner', 'outer'"),
+        (fem.ConstantFibres([1.0, 0.0]), "must have 3 components"),
+        (fem.FibreFunction(lambda x: x[:2]), r"fibre of shape \(2, 3\)"),
+        (fem.FibreFunction(lambda x: (x, x)), r"sheet must not be parallel to fibre \(cells 0, 1"),
+        (fem.FibreFunction(lambda x: 0 * x), r"fibre must be finite and not zero \(cells 0, 1"),
+        (wall(outer=fem.Tag("inner")), "inner and outer must not touch"),
+        (wall(outer=fem.Tag("nothing")), "the mesh has 'inner', 'outer'"),
     ],
 )
 def test_directions_that_do_not_fit_the_body_are_an_error(spec, message):
@@ -291,7 +278,7 @@ def test_directions_that_do_not_fit_the_body_are_an_error(spec, message):
 
 
 def test_long_axis_across_the_wall_is_an_error():
-    mesh = box([1.0, 1.0, 1.0], [3, 2, 2])
+    mesh = fem.box([1.0, 1.0, 1.0], [3, 2, 2])
     spec = wall(
         inner=lambda x: x[:, 0] < 1e-6, outer=lambda x: x[:, 0] > 1 - 1e-6, longitudinal=[1, 0, 0]
     )

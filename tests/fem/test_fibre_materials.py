@@ -9,38 +9,21 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from dpl.fem import (
-    ConstantFibres,
-    DemirayK2,
-    FibreEnergy,
-    FibreFunction,
-    FibreReinforced,
-    Guccione,
-    HolzapfelGasserOgdenFibres,
-    HolzapfelOgdenFibres,
-    LinearElastic,
-    Material,
-    NeoHookeanIsoK2,
-    NeoHookeanIsoK4,
-    Problem,
-    VolumetricK2,
-    VolumetricK4,
-    box,
-)
-from dpl.fem.materials.fibre_energies import COMPONENTS
+from dpl import fem
+from dpl.fem.materials.fibres.energies import COMPONENTS
 from dpl.fem.materials.tensors import green_lagrange, volume_change
 
 FIBRES = {
-    "guccione": Guccione(0.4, 8.0, 2.0, 4.0),
-    "two_families": HolzapfelGasserOgdenFibres(0.5, 2.0, 0.1, 0.6),
-    "one_family": HolzapfelGasserOgdenFibres(0.5, 2.0, 0.2, 0.6, families=1),
-    "holzapfel_ogden": HolzapfelOgdenFibres(0.5, 2.0, 0.3, 3.0, 0.2, 1.5),
+    "guccione": fem.Guccione(0.4, 8.0, 2.0, 4.0),
+    "two_families": fem.HolzapfelGasserOgdenFibres(0.5, 2.0, 0.1, 0.6),
+    "one_family": fem.HolzapfelGasserOgdenFibres(0.5, 2.0, 0.2, 0.6, families=1),
+    "holzapfel_ogden": fem.HolzapfelOgdenFibres(0.5, 2.0, 0.3, 3.0, 0.2, 1.5),
 }
 MATRICES = {
-    "guccione": VolumetricK2(5.0),
-    "two_families": NeoHookeanIsoK4(0.3),
-    "one_family": VolumetricK4(3.0),
-    "holzapfel_ogden": DemirayK2(0.3, 2.0, 5.0),
+    "guccione": fem.VolumetricK2(5.0),
+    "two_families": fem.NeoHookeanIsoK4(0.3),
+    "one_family": fem.VolumetricK4(3.0),
+    "holzapfel_ogden": fem.DemirayK2(0.3, 2.0, 5.0),
 }
 EYE = torch.eye(3, dtype=torch.float64)
 # frames whose fibre f lies along or across the first axis; the sheet lies in the plane of 1 and 2
@@ -50,10 +33,10 @@ NORMAL = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]).doubl
 
 
 @dataclass(frozen=True)
-class EnergyAlone(Material):
+class EnergyAlone(fem.Material):
     """A law of which nothing is known but its energy: derivatives by autodiff."""
 
-    law: Material
+    law: fem.Material
 
     def energy(self, H: Tensor) -> Tensor:
         return self.law.energy(H)
@@ -84,13 +67,13 @@ def name(request) -> str:
 
 
 @pytest.fixture
-def fibres(name) -> FibreEnergy:
+def fibres(name) -> fem.FibreEnergy:
     return FIBRES[name]
 
 
 @pytest.fixture
-def law(name, frames) -> FibreReinforced:
-    return FibreReinforced(MATRICES[name], FIBRES[name], frames)
+def law(name, frames) -> fem.FibreReinforced:
+    return fem.FibreReinforced(MATRICES[name], FIBRES[name], frames)
 
 
 def rotations(count: int, generator: torch.Generator) -> Tensor:
@@ -111,11 +94,6 @@ def assert_near(found: Tensor, wanted: Tensor, tolerance: float) -> None:
 
 
 # ------------------------------------------------------------------ derivatives
-
-
-def test_stress_is_the_derivative_of_the_energy(law, gradients):
-    exact = torch.func.grad(lambda H: law.energy(H).sum())(gradients)
-    assert_near(law.stress(gradients), exact, 1e-12)
 
 
 def test_strain_derivatives_are_those_of_the_energy(fibres, gradients):
@@ -150,43 +128,12 @@ def test_strain_derivatives_take_plain_numbers(fibres, gradients):
         assert found == pytest.approx(float(wanted), rel=1e-13)
 
 
-def test_tangent_is_the_slope_of_the_stress(law, gradients):
-    change = gradients.flip(0)
-    ahead, behind = (law.stress(gradients + h * change) for h in (1e-6, -1e-6))
-    product = torch.einsum("...ijkl,...kl->...ij", law.tangent(gradients), change)
-    assert_near(product, (ahead - behind) / 2e-6, 1e-7)
-
-
-def test_response_is_the_first_stress_pulled_back(law, gradients):
-    S, D = law.response(green_lagrange(gradients))
-    assert_near((EYE + gradients) @ S, law.stress(gradients), 1e-12)
-    assert_near(S, S.mT, 1e-13)
-    for same in (D.permute(0, 1, 2, 5, 6, 3, 4), D.transpose(-1, -2), D.transpose(-3, -4)):
-        assert_near(D, same, 1e-13)
-
-
-def test_derivatives_may_be_taken_through_the_stress(law, gradients):
-    """Mean dilatation and products with the tangent do so."""
-    change = gradients.flip(0)
-    along = torch.func.jvp(law.stress, (gradients,), (change,))[1]
-    product = torch.einsum("...ijkl,...kl->...ij", law.tangent(gradients), change)
-    assert_near(along, product, 1e-12)
-
-
 # ------------------------------------------------------------------ invariance
-
-
-def test_energy_is_objective(law, gradients, generator):
-    """W(R F) = W(F), P(R F) = R P(F)."""
-    R = rotations(1, generator)[0]
-    turned = R @ (EYE + gradients) - EYE
-    assert_close(law.energy(turned), law.energy(gradients), rtol=1e-12, atol=1e-14)
-    assert_near(law.stress(turned), R @ law.stress(gradients), 1e-12)
 
 
 def test_rotating_fibres_and_body_rotates_the_stress(law, gradients, generator):
     R = rotations(1, generator)[0]
-    twin = FibreReinforced(law.matrix, law.fibres, R @ law.frames)
+    twin = fem.FibreReinforced(law.matrix, law.fibres, R @ law.frames)
     turned = R @ gradients @ R.mT
     assert_close(twin.energy(turned), law.energy(gradients), rtol=1e-12, atol=1e-14)
     assert_near(twin.stress(turned), R @ law.stress(gradients) @ R.mT, 1e-12)
@@ -195,13 +142,13 @@ def test_rotating_fibres_and_body_rotates_the_stress(law, gradients, generator):
 
 
 def test_law_is_anisotropic(law, gradients, generator):
-    twin = FibreReinforced(law.matrix, law.fibres, rotations(5, generator))
+    twin = fem.FibreReinforced(law.matrix, law.fibres, rotations(5, generator))
     assert (twin.energy(gradients) - law.energy(gradients)).abs().max() > 1e-3
 
 
 def test_directions_may_be_reversed(law, gradients):
     """Fibres and sheets have no sense of direction: f, s to -f, -s."""
-    twin = FibreReinforced(law.matrix, law.fibres, law.frames * torch.tensor([-1.0, -1.0, 1.0]))
+    twin = fem.FibreReinforced(law.matrix, law.fibres, law.frames * torch.tensor([-1.0, -1.0, 1.0]))
     assert_close(twin.energy(gradients), law.energy(gradients), rtol=1e-13, atol=1e-15)
 
 
@@ -221,27 +168,14 @@ def test_each_cell_has_its_own_frame(law, gradients):
     assert one.of_cells(torch.tensor([0, 0])) is one
 
 
-def test_single_precision_stays_single(law, gradients):
-    for quantity in (law.energy, law.stress, law.tangent):
-        single = quantity(gradients.float())
-        assert single.dtype == torch.float32
-        assert_near(single.double(), quantity(gradients), 1e-4)
-
-
 # ------------------------------------------------------------------ rest and small strains
 
 
-def test_body_at_rest_has_neither_energy_nor_stress(law):
-    rest = torch.zeros(1, 5, 1, 3, 3, dtype=torch.float64)
-    assert not law.energy(rest).any()
-    assert not law.stress(rest).any()
-
-
-def moduli_at_rest(fibres: FibreEnergy) -> Tensor:
+def moduli_at_rest(fibres: fem.FibreEnergy) -> Tensor:
     """Return dS/dE (3, 3, 3, 3) of the fibres alone, in their frame, at rest."""
-    matrix = VolumetricK2(1.0)
+    matrix = fem.VolumetricK2(1.0)
     zero = torch.zeros(3, 3, dtype=torch.float64)
-    law = FibreReinforced(matrix, fibres, EYE[None])
+    law = fem.FibreReinforced(matrix, fibres, EYE[None])
     return law.response(zero).moduli - matrix.response(zero).moduli
 
 
@@ -289,7 +223,7 @@ def test_tiny_strains_keep_their_digits(law, gradients, size):
 
 def test_average_moduli_are_those_over_all_directions(fibres, generator):
     """The averages of mu and lambda are over rotations: the isotropic part of the moduli."""
-    law = FibreReinforced(VolumetricK2(1.0), fibres, EYE[None])
+    law = fem.FibreReinforced(fem.VolumetricK2(1.0), fibres, EYE[None])
     R = rotations(20000, generator)
     D = law.response(torch.zeros(3, 3, dtype=torch.float64)).moduli
     shear = torch.einsum("ra,rb,rc,rd,abcd->r", R[:, 0], R[:, 1], R[:, 0], R[:, 1], D)
@@ -301,9 +235,10 @@ def test_average_moduli_are_those_over_all_directions(fibres, generator):
 
 def test_fibres_in_all_directions_alike_are_isotropic(gradients, generator):
     """At kappa = 1/3 each family has E = (I1 - 3)/3."""
-    fibres = HolzapfelGasserOgdenFibres(0.5, 2.0, 1 / 3, 0.6)
+    fibres = fem.HolzapfelGasserOgdenFibres(0.5, 2.0, 1 / 3, 0.6)
     law, twin = (
-        FibreReinforced(VolumetricK2(1.0), fibres, rotations(5, generator)) for _ in range(2)
+        fem.FibreReinforced(fem.VolumetricK2(1.0), fibres, rotations(5, generator))
+        for _ in range(2)
     )
     assert_near(law.stress(gradients), twin.stress(gradients), 1e-12)
     assert law.mu == pytest.approx(0, abs=1e-15)
@@ -313,10 +248,10 @@ def test_fibres_in_all_directions_alike_are_isotropic(gradients, generator):
 # ------------------------------------------------------------------ closed forms
 
 
-def second_stress(fibres: FibreEnergy, frame: Tensor, F: Tensor) -> list[float]:
+def second_stress(fibres: fem.FibreEnergy, frame: Tensor, F: Tensor) -> list[float]:
     """Return S11, S22, S33 and S12 of an isochoric F, of the fibres alone."""
     assert torch.linalg.det(F).item() == pytest.approx(1, rel=1e-12)
-    law = FibreReinforced(VolumetricK2(1.0), fibres, frame[None])
+    law = fem.FibreReinforced(fem.VolumetricK2(1.0), fibres, frame[None])
     S = torch.linalg.solve(F, law.stress(F - EYE))
     assert S[[0, 1], 2].abs().max() < 1e-14
     return [S[0, 0].item(), S[1, 1].item(), S[2, 2].item(), S[0, 1].item()]
@@ -345,7 +280,7 @@ LONG, SHORT, THIN = STRETCH**2 - 1, 1 / STRETCH - 1, STRETCH**-4 - 1  # C - 1
 def test_guccione_has_the_closed_forms():
     """S_ij = c b_ij E_ij exp(Q), b the exponent of each component: Guccione et al. (1991)."""
     c, bf, bt, bfs = 0.4, 8.0, 2.0, 4.0
-    fibres, long, short, thin = Guccione(c, bf, bt, bfs), LONG / 2, SHORT / 2, THIN / 2
+    fibres, long, short, thin = fem.Guccione(c, bf, bt, bfs), LONG / 2, SHORT / 2, THIN / 2
     f = c * math.exp(bf * long**2 + 2 * bt * short**2)
     assert second_stress(fibres, ALONG, UNIAXIAL) == values(
         f * bf * long, f * bt * short, f * bt * short, 0
@@ -372,7 +307,7 @@ def test_guccione_has_the_closed_forms():
 def test_families_have_the_closed_forms():
     """S = sum of 2 k1 E_i exp(k2 E_i^2) (kappa I + (1 - 3 kappa) a_i x a_i): Gasser et al."""
     k1, k2, kappa, angle = 0.5, 2.0, 0.1, 0.8
-    fibres = HolzapfelGasserOgdenFibres(k1, k2, kappa, angle)
+    fibres = fem.HolzapfelGasserOgdenFibres(k1, k2, kappa, angle)
     cos, sin, axial = math.cos(angle), math.sin(angle), 1 - 3 * kappa
 
     def factor(E: float) -> float:
@@ -400,7 +335,7 @@ def test_families_have_the_closed_forms():
         diagonal = (f * (kappa + axial * part) for part in (first**2, second**2, 0))
         wanted = values(*diagonal, f * axial * cos * sin)
         assert second_stress(fibres, frame, shear(SHEAR)) == wanted
-        one = HolzapfelGasserOgdenFibres(k1, k2, kappa, angle, families=1)
+        one = fem.HolzapfelGasserOgdenFibres(k1, k2, kappa, angle, families=1)
         assert second_stress(one, frame, shear(SHEAR)) == wanted
         assert second_stress(one, frame, shear(-SHEAR)) == [0, 0, 0, 0]
 
@@ -408,7 +343,9 @@ def test_families_have_the_closed_forms():
 def test_two_equal_families_are_twice_one(gradients, frames):
     """At an angle of 0 there is one direction; `families` says how often it counts."""
     one, two = (
-        FibreReinforced(VolumetricK2(1.0), HolzapfelGasserOgdenFibres(k1, 2.0, 0.1, 0.0, n), frames)
+        fem.FibreReinforced(
+            fem.VolumetricK2(1.0), fem.HolzapfelGasserOgdenFibres(k1, 2.0, 0.1, 0.0, n), frames
+        )
         for k1, n in ((1.0, 1), (0.5, 2))
     )
     assert_near(one.stress(gradients), two.stress(gradients), 1e-14)
@@ -416,7 +353,7 @@ def test_two_equal_families_are_twice_one(gradients, frames):
 
 def test_holzapfel_ogden_has_the_closed_forms():
     """S = 2 a <x> exp(b <x>^2) of fibres and sheets; S12 = afs C12 exp(bfs C12^2), (2009)."""
-    fibres = HolzapfelOgdenFibres(0.5, 2.0, 0.3, 3.0, 0.2, 1.5)
+    fibres = fem.HolzapfelOgdenFibres(0.5, 2.0, 0.3, 3.0, 0.2, 1.5)
 
     def fibre(x: float) -> float:
         return 2 * 0.5 * x * math.exp(2.0 * x**2)
@@ -439,11 +376,13 @@ def test_holzapfel_ogden_has_the_closed_forms():
 @pytest.mark.parametrize("name", ["two_families", "one_family", "holzapfel_ogden"])
 def test_shortened_fibres_have_neither_stress_nor_stiffness(name):
     H = stretch(0.9, 0.95, 0.99) - EYE
-    law = FibreReinforced(MATRICES[name], FIBRES[name], EYE[None])
+    law = fem.FibreReinforced(MATRICES[name], FIBRES[name], EYE[None])
     assert law.energy(H) == law.matrix.energy(H)
     assert_close(law.stress(H), law.matrix.stress(H), rtol=0, atol=0)
     if name == "holzapfel_ogden":  # its shear resists either way
-        law = FibreReinforced(law.matrix, HolzapfelOgdenFibres(0.5, 2, 0.3, 3, 0.0, 1), EYE[None])
+        law = fem.FibreReinforced(
+            law.matrix, fem.HolzapfelOgdenFibres(0.5, 2, 0.3, 3, 0.0, 1), EYE[None]
+        )
     assert_close(law.tangent(H), law.matrix.tangent(H), rtol=0, atol=0)
 
 
@@ -451,7 +390,7 @@ def test_fibres_have_their_stiffness_at_rest():
     """Stretched fibres decide the moduli there, so that the linear solution resists."""
     zero = torch.zeros(3, 3, dtype=torch.float64)
     for fibres in (FIBRES["two_families"], FIBRES["one_family"], FIBRES["holzapfel_ogden"]):
-        law = FibreReinforced(VolumetricK2(1.0), fibres, EYE[None])
+        law = fem.FibreReinforced(fem.VolumetricK2(1.0), fibres, EYE[None])
         D = law.response(torch.diag(torch.full((3,), 1e-9)).double()).moduli
         assert_near(law.response(zero).moduli, D, 1e-7)
 
@@ -461,7 +400,7 @@ def test_fibres_have_their_stiffness_at_rest():
 
 def test_demiray_has_the_closed_forms():
     """Holzapfel, Ogden (2009): sigma11 - sigma22 = a (s^2 - 1/s) exp(b (s^2 + 2/s - 3))."""
-    law = DemirayK2(0.3, 2.0, 5.0)
+    law = fem.DemirayK2(0.3, 2.0, 5.0)
     sigma = law.stress(UNIAXIAL - EYE) @ UNIAXIAL.mT
     wanted = 0.3 * (LONG - SHORT) * math.exp(2.0 * (LONG + 2 * SHORT))
     assert (sigma[0, 0] - sigma[1, 1]).item() == pytest.approx(wanted, rel=1e-12)
@@ -472,8 +411,8 @@ def test_demiray_has_the_closed_forms():
 
 
 def test_small_exponent_of_demiray_is_the_neo_hookean_solid(gradients):
-    limit = NeoHookeanIsoK2(0.3)
-    law = DemirayK2(limit.mu, 1e-12, limit.bulk)
+    limit = fem.NeoHookeanIsoK2(0.3)
+    law = fem.DemirayK2(limit.mu, 1e-12, limit.bulk)
     assert_near(law.energy(gradients), limit.energy(gradients), 1e-10)
     assert_near(law.stress(gradients), limit.stress(gradients), 1e-10)
     assert_near(law.tangent(gradients), limit.tangent(gradients), 1e-10)
@@ -482,9 +421,9 @@ def test_small_exponent_of_demiray_is_the_neo_hookean_solid(gradients):
 @pytest.mark.parametrize(
     ("law", "slope"),
     [
-        (VolumetricK2(5.0), lambda J: 5.0 * (J - 1)),
-        (VolumetricK4(5.0), lambda J: 5.0 / 2 * (J - 1 / J)),
-        (DemirayK2(0.3, 2.0, 5.0), lambda J: 5.0 * (J - 1)),
+        (fem.VolumetricK2(5.0), lambda J: 5.0 * (J - 1)),
+        (fem.VolumetricK4(5.0), lambda J: 5.0 / 2 * (J - 1 / J)),
+        (fem.DemirayK2(0.3, 2.0, 5.0), lambda J: 5.0 * (J - 1)),
     ],
 )
 def test_volumetric_energies_have_their_pressure(law, slope):
@@ -492,17 +431,9 @@ def test_volumetric_energies_have_their_pressure(law, slope):
     for s in (0.8, 1.2):
         P = law.stress((s - 1) * EYE)
         assert_close(P, slope(s**3) * s**2 * EYE, rtol=1e-12, atol=1e-14)
-    if not isinstance(law, DemirayK2):
+    if not isinstance(law, fem.DemirayK2):
         assert law.stress(shear(SHEAR) - EYE).abs().max() < 1e-14
         assert (law.mu, law.lam) == (0, pytest.approx(5.0))
-
-
-@pytest.mark.parametrize("law", [VolumetricK2(5.0), VolumetricK4(5.0), DemirayK2(0.3, 2.0, 5.0)])
-def test_isotropic_parts_are_derivatives_of_their_energies(law, gradients):
-    exact = torch.func.grad(lambda H: law.energy(H).sum())(gradients)
-    assert_near(law.stress(gradients), exact, 1e-12)
-    H = gradients.reshape(-1, 3, 3)
-    assert_near(law.tangent(H), EnergyAlone(law).tangent(H), 1e-10)
 
 
 # ------------------------------------------------------------------ bodies, identity, errors
@@ -511,10 +442,10 @@ def test_isotropic_parts_are_derivatives_of_their_energies(law, gradients):
 @pytest.mark.parametrize("name", FIBRES)
 def test_forces_of_a_body_are_the_gradient_of_its_energy(name, generator):
     """Each point has the frame of its place."""
-    mesh = box([1.0, 0.5, 0.5], [4, 3, 3]).translated([7.0, 0.0, 0.0])
-    spec = FibreFunction(lambda x: torch.cos(torch.from_numpy(x * [1.0, 2.0, 3.0])).numpy())
-    law = FibreReinforced(MATRICES[name], FIBRES[name], spec)
-    body = Problem.build(mesh, NeoHookeanIsoK4(0.3))
+    mesh = fem.box([1.0, 0.5, 0.5], [4, 3, 3]).translated([7.0, 0.0, 0.0])
+    spec = fem.FibreFunction(lambda x: torch.cos(torch.from_numpy(x * [1.0, 2.0, 3.0])).numpy())
+    law = fem.FibreReinforced(MATRICES[name], FIBRES[name], spec)
+    body = fem.Problem.build(mesh, fem.NeoHookeanIsoK4(0.3))
     law = law.on(body.basis, body.length, body.origin)
     body = body.with_material(law)
     assert law.frames.shape == (12, 8, 3, 3)
@@ -524,15 +455,15 @@ def test_forces_of_a_body_are_the_gradient_of_its_energy(name, generator):
 
 
 def test_identity_is_plain_data_that_tells_laws_apart(law, generator):
-    twin = FibreReinforced(law.matrix, law.fibres, law.frames.clone())
+    twin = fem.FibreReinforced(law.matrix, law.fibres, law.frames.clone())
     assert twin == law
     assert hash(twin) == hash(law)
     assert isinstance(law.identity()["directions"], str)
-    other = FibreReinforced(law.matrix, law.fibres, rotations(5, generator))
+    other = fem.FibreReinforced(law.matrix, law.fibres, rotations(5, generator))
     assert other != law
     assert other.identity() != law.identity()
     assert law.identity()["fibres"]["name"] == type(law.fibres).__name__
-    spec = FibreReinforced(law.matrix, law.fibres, ConstantFibres([1.0, 0.0, 0.0]))
+    spec = fem.FibreReinforced(law.matrix, law.fibres, fem.ConstantFibres([1.0, 0.0, 0.0]))
     assert spec.identity()["directions"] == {
         "name": "ConstantFibres",
         "fibre": [1.0, 0.0, 0.0],
@@ -541,12 +472,12 @@ def test_identity_is_plain_data_that_tells_laws_apart(law, generator):
 
 
 def test_law_needs_its_directions(fibres, gradients):
-    law = FibreReinforced(VolumetricK2(1.0), fibres, FibreFunction(lambda x: x))
+    law = fem.FibreReinforced(fem.VolumetricK2(1.0), fibres, fem.FibreFunction(lambda x: x))
     with pytest.raises(ValueError, match="FibreFunction must be evaluated on a body"):
         law.stress(gradients)
     assert law.mu >= 0  # averages need no directions
-    body = Problem.build(box([1.0, 1.0, 1.0], [2, 2, 2]), NeoHookeanIsoK4(0.3))
-    known = FibreReinforced(VolumetricK2(1.0), fibres, EYE.expand(3, 3, 3))
+    body = fem.Problem.build(fem.box([1.0, 1.0, 1.0], [2, 2, 2]), fem.NeoHookeanIsoK4(0.3))
+    known = fem.FibreReinforced(fem.VolumetricK2(1.0), fibres, EYE.expand(3, 3, 3))
     with pytest.raises(ValueError, match="frames of 3 cells and must have those of 1"):
         known.on(body.basis, body.length, body.origin)
 
@@ -554,24 +485,30 @@ def test_law_needs_its_directions(fibres, gradients):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Guccione(0.0, 1, 1, 1), "c = 0.0 must be above 0"),
-        (lambda: Guccione(1, 1, -1, 1), "bt = -1 must be above 0"),
-        (lambda: Guccione(1, 1, 1, math.nan), "bfs = nan must be above 0"),
-        (lambda: HolzapfelGasserOgdenFibres(0, 1), "k1 = 0 must be above 0"),
-        (lambda: HolzapfelGasserOgdenFibres(1, math.inf), "k2 = inf must be above 0"),
-        (lambda: HolzapfelGasserOgdenFibres(1, 1, 0.34), "kappa = 0.34 must lie between 0 and 1/3"),
-        (lambda: HolzapfelGasserOgdenFibres(1, 1, -0.1), "kappa = -0.1 must lie between 0 and 1/3"),
-        (lambda: HolzapfelGasserOgdenFibres(1, 1, 0, math.nan), "angle = nan must be a finite"),
-        (lambda: HolzapfelGasserOgdenFibres(1, 1, 0, 0, 3), "families = 3 must be 1 or 2"),
-        (lambda: HolzapfelOgdenFibres(0, 1, 1, 1, 1, 1), "af = 0 must be above 0"),
-        (lambda: HolzapfelOgdenFibres(1, 1, -1, 1, 1, 1), "as_ = -1 must be at least 0"),
-        (lambda: HolzapfelOgdenFibres(1, 1, 0, 1, 0, 0), "bfs = 0 must be above 0"),
-        (lambda: DemirayK2(0, 1, 1), "a = 0 must be above 0"),
-        (lambda: DemirayK2(1, 0, 1), "b = 0 must be above 0"),
-        (lambda: DemirayK2(1, 1, 0), "bulk = 0 must be above 0"),
-        (lambda: VolumetricK2(0), "bulk = 0 must be above 0"),
-        (lambda: VolumetricK4(math.inf), "bulk = inf must be above 0"),
-        (lambda: reinforced(matrix=LinearElastic(0.3)), "matrix = LinearElastic must be"),
+        (lambda: fem.Guccione(0.0, 1, 1, 1), "c = 0.0 must be above 0"),
+        (lambda: fem.Guccione(1, 1, -1, 1), "bt = -1 must be above 0"),
+        (lambda: fem.Guccione(1, 1, 1, math.nan), "bfs = nan must be above 0"),
+        (lambda: fem.HolzapfelGasserOgdenFibres(0, 1), "k1 = 0 must be above 0"),
+        (lambda: fem.HolzapfelGasserOgdenFibres(1, math.inf), "k2 = inf must be above 0"),
+        (
+            lambda: fem.HolzapfelGasserOgdenFibres(1, 1, 0.34),
+            "kappa = 0.34 must lie between 0 and 1/3",
+        ),
+        (
+            lambda: fem.HolzapfelGasserOgdenFibres(1, 1, -0.1),
+            "kappa = -0.1 must lie between 0 and 1/3",
+        ),
+        (lambda: fem.HolzapfelGasserOgdenFibres(1, 1, 0, math.nan), "angle = nan must be a finite"),
+        (lambda: fem.HolzapfelGasserOgdenFibres(1, 1, 0, 0, 3), "families = 3 must be 1 or 2"),
+        (lambda: fem.HolzapfelOgdenFibres(0, 1, 1, 1, 1, 1), "af = 0 must be above 0"),
+        (lambda: fem.HolzapfelOgdenFibres(1, 1, -1, 1, 1, 1), "as_ = -1 must be at least 0"),
+        (lambda: fem.HolzapfelOgdenFibres(1, 1, 0, 1, 0, 0), "bfs = 0 must be above 0"),
+        (lambda: fem.DemirayK2(0, 1, 1), "a = 0 must be above 0"),
+        (lambda: fem.DemirayK2(1, 0, 1), "b = 0 must be above 0"),
+        (lambda: fem.DemirayK2(1, 1, 0), "bulk = 0 must be above 0"),
+        (lambda: fem.VolumetricK2(0), "bulk = 0 must be above 0"),
+        (lambda: fem.VolumetricK4(math.inf), "bulk = inf must be above 0"),
+        (lambda: reinforced(matrix=fem.LinearElastic(0.3)), "matrix = LinearElastic must be"),
         (lambda: reinforced(directions=torch.eye(3)), "must have .cells, 3, 3."),
         (
             lambda: reinforced(directions=2 * EYE[None]),
@@ -585,6 +522,6 @@ def test_invalid_constants_are_an_error(build, message):
         build()
 
 
-def reinforced(**parts: object) -> FibreReinforced:
-    whole = {"matrix": VolumetricK2(1.0), "fibres": FIBRES["guccione"], "directions": EYE[None]}
-    return FibreReinforced(**(whole | parts))
+def reinforced(**parts: object) -> fem.FibreReinforced:
+    whole = {"matrix": fem.VolumetricK2(1.0), "fibres": FIBRES["guccione"], "directions": EYE[None]}
+    return fem.FibreReinforced(**(whole | parts))

@@ -225,7 +225,7 @@ def test_cube_of_rivlin_loses_its_symmetry_at_two_shear_moduli_in_the_limit():
         law = NeoHookeanLn(poisson)
         problem, _ = rivlin(law)
         critical = bisected(partial(loses_symmetry, problem), 1.0, 1.1)
-        excess.append(equitriaxial_stretch(problem, critical)[1] / law.mu - 2)
+        excess.append(equitriaxial_stretch(problem, critical)[1] / float(law.mu) - 2)
     assert excess[1] == pytest.approx(0, abs=1e-3)
     assert excess[0] / excess[1] == pytest.approx(10, rel=0.05)
 
@@ -255,7 +255,7 @@ def test_quadratic_volume_term_is_no_barrier_under_pressure(mixed):
     """NHiso-k2 carries kappa s^2 (1 - s^3) at most, s^3 = 2/5; NH-ln carries any pressure."""
     law = NeoHookeanIsoK2(0.3)
     problem, unit = rivlin(law)
-    limit = law.bulk * 0.4 ** (2 / 3) * 0.6
+    limit = float(law.bulk) * 0.4 ** (2 / 3) * 0.6
     for part, status in ((0.99, Status.CONVERGED), (1.02, Status.NO_VALID_EQUILIBRIUM)):
         solver = Newton(problem, linear="superlu", mixed_integration=mixed)
         answer = solve(solver, as_load(-part * limit * unit))

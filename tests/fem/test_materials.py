@@ -3,29 +3,16 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import cycle
 
 import pytest
 import torch
-from laws import HOOKEAN
+from laws import HOOKEAN, LAWS
 from scipy.optimize import brentq, minimize_scalar
 from torch import Tensor
 from torch.testing import assert_close
 
-from dpl.fem import (
-    FibreReinforced,
-    InvariantBasedMaterial,
-    LinearElastic,
-    Material,
-    MooneyRivlinK2,
-    NeoHookeanIsoK2,
-    NeoHookeanIsoK4,
-    NeoHookeanLn,
-    OgdenK2,
-    SaintVenantKirchhoff,
-    StableNeoHookean,
-    YeohK2,
-    YoungPoissonMaterial,
-)
+from dpl import fem
 from dpl.fem.materials.tensors import (
     cofactor,
     green_lagrange,
@@ -34,19 +21,28 @@ from dpl.fem.materials.tensors import (
     volume_change,
 )
 
-SVK, NH, SNH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3), StableNeoHookean(0.3)
+SVK, NH, SNH = fem.SaintVenantKirchhoff(0.3), fem.NeoHookeanLn(0.3), fem.StableNeoHookean(0.3)
 EYE = torch.eye(3, dtype=torch.float64)
 SHEAR = torch.zeros(3, 3, dtype=torch.float64).index_put_(
     (torch.tensor(0), torch.tensor(1)), torch.tensor(1.0, dtype=torch.float64)
 )
 STRETCHES = (0.7, 0.9, 1.1, 1.5, 2.0)
+MORE = {  # laws and parts of laws beside those of conf/material
+    "demiray": fem.DemirayK2(0.3, 2.0, 5.0),
+    "volumetric_k4": fem.VolumetricK4(5.0),
+    "one_family": fem.FibreReinforced(
+        fem.VolumetricK2(3.0),
+        fem.HolzapfelGasserOgdenFibres(0.5, 2.0, 0.2, 0.6, families=1),
+        fem.ConstantFibres([1.0, 2.0, -0.5], [0.3, -1.0, 0.4]),
+    ),
+}
 
 
 @dataclass(frozen=True)
-class EnergyAlone(Material):
+class EnergyAlone(fem.Material):
     """A law of which nothing is known but its energy: derivatives by autodiff."""
 
-    law: Material
+    law: fem.Material
 
     def energy(self, H):
         return self.law.energy(H)
@@ -191,35 +187,35 @@ def digits(printed: float, count: int = 8):
     return pytest.approx(printed, rel=0, abs=0.5001 * unit)
 
 
-def principal(law: Material, *stretches: float) -> list[float]:
+def principal(law: fem.Material, *stretches: float) -> list[float]:
     """Return the principal stresses P11, P22, P33 of principal stretches."""
     return (
         law.stress(torch.diag(torch.tensor(stretches, dtype=torch.float64)) - EYE).diag().tolist()
     )
 
 
-def uniaxial(law: Material, stretch: float, low: float = 0.05, high: float = 5.0):
+def uniaxial(law: fem.Material, stretch: float, low: float = 0.05, high: float = 5.0):
     """Return the lateral stretch, between two bounds, that leaves the sides free, and P11."""
     side = brentq(lambda s: principal(law, stretch, s, s)[1], low, high, xtol=1e-15, rtol=1e-15)
     return side, principal(law, stretch, side, side)[0]
 
 
 @pytest.fixture(params=HOOKEAN)
-def hookean(request) -> type[YoungPoissonMaterial]:
+def hookean(request) -> type[fem.YoungPoissonMaterial]:
     """Each law that at rest is Hooke's."""
     return request.param
 
 
-@pytest.fixture
-def law(any_law) -> Material:
+@pytest.fixture(params=LAWS | MORE)
+def law(request) -> fem.Material:
     """Each of all laws."""
-    return any_law
+    return (LAWS | MORE)[request.param]
 
 
 @pytest.fixture
-def finite(law) -> Material:
+def finite(law) -> fem.Material:
     """Each law of large rotations."""
-    if isinstance(law, LinearElastic):
+    if isinstance(law, fem.LinearElastic):
         pytest.skip("holds for small rotations only")
     return law
 
@@ -227,7 +223,7 @@ def finite(law) -> Material:
 @pytest.fixture
 def without_fibres(law) -> None:
     """Skip laws with fibres, which test_fibre_materials.py tests."""
-    if isinstance(law, FibreReinforced):
+    if isinstance(law, fem.FibreReinforced):
         pytest.skip("holds for isotropic laws only")
 
 
@@ -267,16 +263,15 @@ def test_cauchy_stress_of_uniaxial_tension_is_tabulated(laws, name):
 @pytest.mark.parametrize("poisson", [0.0, 0.1, 0.3, 0.49])
 def test_uniaxial_tension_follows_the_closed_form(poisson, stretch):
     """The tolerance is 1e-8."""
-    side, axial = uniaxial(SaintVenantKirchhoff(poisson), stretch)
+    side, axial = uniaxial(fem.SaintVenantKirchhoff(poisson), stretch)
     assert axial == pytest.approx(stretch * (stretch**2 - 1) / 2, rel=1e-8)
     assert side**2 == pytest.approx(1 - poisson * (stretch**2 - 1), rel=1e-8)
-    law = NeoHookeanLn(poisson)
+    law = fem.NeoHookeanLn(poisson)
     side, axial = uniaxial(law, stretch)
     log_J = math.log(stretch * side**2)
     assert law.mu * (side - 1 / side) + law.lam * log_J / side == pytest.approx(0, abs=1e-13)
-    assert axial == pytest.approx(
-        law.mu * (stretch - 1 / stretch) + law.lam * log_J / stretch, rel=1e-8
-    )
+    expected = law.mu * (stretch - 1 / stretch) + law.lam * log_J / stretch
+    assert axial == pytest.approx(float(expected), rel=1e-8)
 
 
 @pytest.mark.parametrize("name", BIAXIAL)
@@ -330,11 +325,11 @@ def test_normal_stresses_of_simple_shear_are_universal(law, shear):
     ("law", "printed"),
     [
         (
-            SaintVenantKirchhoff(0.25),
+            fem.SaintVenantKirchhoff(0.25),
             [401316, 145696, -98546, 109033, 127627, 126699, -99618.4, 116577.6, 267958],
         ),
         (
-            NeoHookeanLn(0.25),
+            fem.NeoHookeanLn(0.25),
             [
                 *[205618.06845586, 97900.28180473, -61907.80758191],
                 *[81983.06535369, 29475.07868947, 102746.94162323],
@@ -342,7 +337,7 @@ def test_normal_stresses_of_simple_shear_are_universal(law, shear):
             ],
         ),
         (
-            NeoHookeanIsoK4(0.25),
+            fem.NeoHookeanIsoK4(0.25),
             [
                 *[191096.15853363, 85520.54615522, -53689.81488467],
                 *[69887.02053818, 38843.51112474, 88872.72329322],
@@ -448,9 +443,9 @@ def test_body_at_rest_has_neither_energy_nor_stress(law):
     """Only the energy of SNH at rest is not zero; differences of the energy matter alone."""
     rest = torch.zeros(3, 3, dtype=torch.float64)
     energy = law.energy(rest).item()
-    assert energy == (digits(-0.2730425102, 10) if isinstance(law, StableNeoHookean) else 0)
+    assert energy == (digits(-0.2730425102, 10) if isinstance(law, fem.StableNeoHookean) else 0)
     assert not law.stress(rest).any()
-    if not isinstance(law, OgdenK2):  # its gradient at equal stretches is not defined
+    if not isinstance(law, fem.OgdenK2):  # its gradient at equal stretches is not defined
         assert EnergyAlone(law).stress(rest).abs().max() < 1e-15
 
 
@@ -478,7 +473,8 @@ def test_moduli_at_rest_are_those_of_the_tangent(law):
     A = law.tangent(torch.zeros(3, 3, dtype=torch.float64))
     assert law.mu == pytest.approx(A[0, 1, 0, 1].item(), rel=1e-14)
     assert law.lam == pytest.approx(A[0, 0, 1, 1].item(), rel=1e-14)
-    assert law.poisson_ratio == pytest.approx(law.lam / (2 * (law.lam + law.mu)), rel=1e-14)
+    ratio = float(law.lam / (2 * (law.lam + law.mu)))
+    assert law.poisson_ratio == pytest.approx(ratio, rel=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -503,37 +499,6 @@ def test_tiny_gradients_keep_the_digits_of_hooke(law, gradients, size):
     assert error.max() < 1e-9
 
 
-@pytest.mark.parametrize("poisson", [-1.0, 0.5, 0.7, -3.0, math.nan, math.inf, -math.inf])
-def test_poisson_ratio_out_of_range_is_an_error(hookean, poisson):
-    with pytest.raises(ValueError, match="poisson"):
-        hookean(poisson)
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda: MooneyRivlinK2(0.1, -0.1, 2.0), "c10"),
-        (lambda: MooneyRivlinK2(0.1, -0.2, 2.0), "c10"),
-        (lambda: MooneyRivlinK2(math.nan, 0.1, 2.0), "c10"),
-        (lambda: MooneyRivlinK2(0.1, math.inf, 2.0), "c10"),
-        (lambda: MooneyRivlinK2(0.1, 0.1, 0.0), "bulk"),
-        (lambda: YeohK2(0.0, 0.1, 0.1, 2.0), "c10"),
-        (lambda: YeohK2(-0.1, 0.1, 0.1, 2.0), "c10"),
-        (lambda: YeohK2(0.2, 0.1, 0.1, -2.0), "bulk"),
-        (lambda: YeohK2(0.2, 0.1, 0.1, math.nan), "bulk"),
-        (lambda: OgdenK2([0.1, 0.2], [1.3], 2.0), "exponents"),
-        (lambda: OgdenK2([0.1], [1.3, 2.0], 2.0), "exponents"),
-        (lambda: OgdenK2([0.1, 0.2], [1.3, 0.0], 2.0), "exponents"),
-        (lambda: OgdenK2([0.1, -0.2], [1.3, 2.0], 2.0), "shear"),
-        (lambda: OgdenK2([], [], 2.0), "shear"),
-        (lambda: OgdenK2([0.1], [2.0], math.inf), "bulk"),
-    ],
-)
-def test_moduli_of_a_body_that_resists_nothing_are_an_error(build, message):
-    with pytest.raises(ValueError, match=message):
-        build()
-
-
 def test_volume_change_is_exact_for_tiny_gradients(gradients):
     tiny = 1e-12 * gradients
     assert_close(volume_change(tiny), tiny.diagonal(dim1=-2, dim2=-1).sum(-1), rtol=1e-9, atol=0.0)
@@ -544,8 +509,8 @@ def test_volume_change_is_exact_for_tiny_gradients(gradients):
 
 def test_ogden_with_one_term_of_exponent_two_is_neo_hookean(gradients):
     """mu/2 (Ib1 - 3) + bulk/2 (J - 1)^2 is both."""
-    law = NeoHookeanIsoK2(0.3)
-    ogden = OgdenK2([law.mu], [2.0], law.bulk)
+    law = fem.NeoHookeanIsoK2(0.3)
+    ogden = fem.OgdenK2([float(law.mu)], [2.0], float(law.bulk))
     assert_close(ogden.energy(gradients), law.energy(gradients), rtol=1e-11, atol=1e-14)
     assert_close(ogden.stress(gradients), law.stress(gradients), rtol=1e-11, atol=1e-13)
     assert_close(ogden.tangent(gradients), law.tangent(gradients), rtol=1e-9, atol=1e-11)
@@ -554,26 +519,26 @@ def test_ogden_with_one_term_of_exponent_two_is_neo_hookean(gradients):
 def test_ogden_with_exponents_of_two_is_mooney_rivlin(gradients, laws):
     """Ib2 - 3 is the sum of lb^-2 - 1: c10 = mu1/2 and c01 = mu2/2 at exponents 2 and -2."""
     law = laws["mooney_rivlin_k2"]
-    ogden = OgdenK2([2 * law.c10, 2 * law.c01], [2.0, -2.0], law.bulk)
+    ogden = fem.OgdenK2([2 * law.c10, 2 * law.c01], [2.0, -2.0], law.bulk)
     assert_close(ogden.energy(gradients), law.energy(gradients), rtol=1e-11, atol=1e-14)
     assert_close(ogden.stress(gradients), law.stress(gradients), rtol=1e-11, atol=1e-13)
 
 
 def test_yeoh_of_one_term_is_mooney_rivlin_without_its_second(gradients):
-    yeoh, mooney = YeohK2(0.2, 0.0, 0.0, 2.0), MooneyRivlinK2(0.2, 0.0, 2.0)
+    yeoh, mooney = fem.YeohK2(0.2, 0.0, 0.0, 2.0), fem.MooneyRivlinK2(0.2, 0.0, 2.0)
     assert_close(yeoh.stress(gradients), mooney.stress(gradients), rtol=1e-13, atol=1e-15)
     assert_close(yeoh.tangent(gradients), mooney.tangent(gradients), rtol=1e-13, atol=1e-15)
 
 
 @pytest.fixture
-def isotropic(law) -> InvariantBasedMaterial:
+def isotropic(law) -> fem.InvariantBasedMaterial:
     """Each law that is given by slopes of its own."""
-    if not isinstance(law, InvariantBasedMaterial) or not law.finite:
+    if not isinstance(law, fem.InvariantBasedMaterial) or not law.finite:
         pytest.skip("has no slopes of its own")
     return law
 
 
-def slopes_at(law: InvariantBasedMaterial, logs: Tensor) -> tuple[Tensor, ...]:
+def slopes_at(law: fem.InvariantBasedMaterial, logs: Tensor) -> tuple[Tensor, ...]:
     """Return I1, all slopes and the three squared stretches at log stretches (..., 3)."""
     squares = (2 * logs).exp()
     I1, log_J = squares.sum(-1), logs.sum(-1)
@@ -590,7 +555,7 @@ def logs() -> Tensor:
     return torch.rand(10, 3, generator=random, dtype=torch.float64) * 0.8 - 0.4
 
 
-def stretched(law: Material, logs: Tensor) -> Tensor:
+def stretched(law: fem.Material, logs: Tensor) -> Tensor:
     """Return the energy at log stretches (..., 3)."""
     return law.energy(torch.diag_embed(torch.expm1(logs)))
 
@@ -717,16 +682,16 @@ def test_neo_hookean_softens_where_it_is_torn_from_all_sides():
 @pytest.mark.parametrize(("poisson", "limit"), [(0.49, 2.8977), (0.499, 2.7337)])
 def test_dead_hydrostatic_load_of_neo_hookean_has_a_limit_point(poisson, limit):
     """There is none for nu = 0.45."""
-    law = NeoHookeanLn(poisson)
+    law = fem.NeoHookeanLn(poisson)
     assert peak_of(lambda s: principal(law, s, s, s)[0], 1.0, 4.0) == pytest.approx(limit, abs=6e-5)
-    tame = NeoHookeanLn(0.45)
+    tame = fem.NeoHookeanLn(0.45)
     stresses = [principal(tame, s, s, s)[0] for s in (1.0, 2.0, 2.5, 3.0, 4.0, 8.0)]
     assert stresses == sorted(stresses)
 
 
 def test_quadratic_volume_term_is_no_barrier():
     """Volumetric collapse of NHiso-k2 costs kappa/2 = .4166667."""
-    energy = NeoHookeanIsoK2(0.3).energy(-(1 - 1e-3) * EYE)
+    energy = fem.NeoHookeanIsoK2(0.3).energy(-(1 - 1e-3) * EYE)
     assert energy.item() == pytest.approx(0.4166667, abs=2e-7)
 
 
@@ -781,33 +746,27 @@ def test_linear_law_is_hooke_at_any_gradient(gradients, laws):
     assert not law.has_response
 
 
-def test_law_without_response_says_so():
+def test_a_law_says_what_it_has_not():
     assert SVK.has_response
-    assert NH.has_response
-    assert not Material().has_response
-    with pytest.raises(NotImplementedError, match="Material"):
-        Material().response(EYE)
-
-
-def test_law_without_energy_says_so():
-    with pytest.raises(NotImplementedError, match="Material has no energy"):
-        Material().energy(EYE)
-
-
-def test_law_of_invariants_without_slopes_says_so():
-    with pytest.raises(NotImplementedError):
-        InvariantBasedMaterial().stress(0.1 * EYE)
+    assert not fem.Material().has_response
+    for call in (
+        fem.Material().response,
+        fem.Material().energy,
+        fem.InvariantBasedMaterial().stress,
+    ):
+        with pytest.raises(NotImplementedError):
+            call(0.1 * EYE)
 
 
 # ------------------------------------------------------------------ a batch of Poisson's ratios
 
 
 @dataclass(frozen=True)
-class SoleEnergy(YoungPoissonMaterial):
+class SoleEnergy(fem.YoungPoissonMaterial):
     """The energy of NH-ln with a Poisson's ratio for each member of a batch, and nothing else."""
 
     def energy(self, H):
-        return NeoHookeanLn(self.poisson).energy(H)
+        return fem.NeoHookeanLn(self.poisson).energy(H)
 
 
 RATIOS = torch.tensor([-0.3, 0.0, 0.2, 0.3, 0.45], dtype=torch.float64)
@@ -819,8 +778,7 @@ def test_members_of_a_batch_answer_as_bodies_with_their_own_poissons_ratio(kind,
     H = gradients.reshape(5, 2, 2, 3, 3)
     ranged = kind([-0.3, 0.45])
     whole = ranged.with_parameters(RATIOS[:, None])
-    assert whole.is_batched
-    assert not ranged.is_batched
+    assert whole.value("poisson").shape == (5, 1, 1)
     for k, ratio in enumerate(RATIOS.tolist()):
         one = ranged.with_parameters(RATIOS[k].view(1, 1))
         assert one == kind(ratio)
@@ -835,40 +793,18 @@ def test_members_of_a_batch_answer_as_bodies_with_their_own_poissons_ratio(kind,
             assert_close(found.moduli[k], wanted.moduli, rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize(
-    "ratios", [[-1.0, 0.3], [0.3, 0.5], [0.3, math.nan], [0.3, 0.7], [-2.0, 0.3]]
-)
-def test_a_batch_with_one_ratio_out_of_range_is_an_error(hookean, ratios):
-    with pytest.raises(ValueError, match="poisson"):
-        hookean([0.2, 0.4]).with_parameters(torch.tensor(ratios, dtype=torch.float64)[:, None])
-
-
-@pytest.mark.parametrize("span", [[0.2, 0.4], (0.2, 0.4), [-0.999, 0.499], [0, 0.4]])
-def test_a_law_with_a_range_says_so_and_has_no_moduli(hookean, span):
-    law = hookean(span)
+@pytest.mark.parametrize("span", [(0.2, 0.4), [-0.999, 0.499], [0, 0.4]])
+def test_a_law_with_a_range_says_so_and_has_no_moduli(span):
+    law = fem.NeoHookeanLn(span)
     assert law.parameter_ranges == {"poisson": tuple(span)}
     assert all(isinstance(end, float) for end in law.parameter_ranges["poisson"])
-    assert not law.is_batched
-    for moduli in (lambda: law.mu, lambda: law.lam, lambda: law.bulk):
-        with pytest.raises(ValueError, match="is a range"):
-            moduli()
-
-
-@pytest.mark.parametrize(
-    "span",
-    [
-        *([0.4, 0.2], [0.3, 0.3], [-1.0, 0.3], [0.2, 0.5], [-2.0, 0.3], [0.2, 0.6], []),
-        *([0.2], [0.1, 0.2, 0.3], [math.nan, 0.3], [0.2, math.nan]),
-    ],
-)
-def test_a_range_that_holds_no_ratios_is_an_error(hookean, span):
-    with pytest.raises(ValueError, match=r"poisson = .* must (be a range|lie between)"):
-        hookean(span)
+    for modulus in ("mu", "lam", "bulk", "poisson_ratio"):
+        with pytest.raises(ValueError, match=r"poisson = .* is a range"):
+            getattr(law, modulus)
 
 
 def test_a_law_of_numbers_has_no_ranges_and_takes_no_parameters(law):
     assert law.parameter_ranges == {}
-    assert law.is_batched is False
     assert law.with_parameters(torch.zeros(3, 0)) is law
     with pytest.raises(ValueError, match=r"has ranges of \[\]"):
         law.with_parameters(torch.tensor([[0.3]]))
@@ -893,29 +829,55 @@ def test_single_precision_stays_single_and_is_as_exact(law, gradients):
         assert_close(single.double(), double, rtol=0, atol=1e-4 * size)
 
 
-@pytest.mark.parametrize("constant", [math.nan, math.inf])
-@pytest.mark.parametrize(
-    "build",
-    [
-        lambda c: YeohK2(0.2, c, 0.1, 2.0),
-        lambda c: YeohK2(0.2, 0.1, c, 2.0),
-        lambda c: YeohK2(0.2, 0.1, 0.1, c),
-        lambda c: MooneyRivlinK2(0.1, 0.1, c),
-        lambda c: OgdenK2([0.1], [c], 2.0),
-        lambda c: OgdenK2([0.1], [2.0], c),
-    ],
-)
-def test_a_modulus_that_is_no_finite_number_is_an_error(build, constant):
-    with pytest.raises(ValueError, match="must be"):
-        build(constant)
-
-
 def test_moduli_may_be_negative_where_the_body_still_resists():
     """Only the shear and the bulk modulus at rest have a sign."""
-    assert MooneyRivlinK2(0.2, -0.1, 2.0).mu == pytest.approx(0.2)
-    assert YeohK2(0.2, -0.1, -0.1, 2.0).mu == pytest.approx(0.4)
-    assert OgdenK2([0.3, -0.1], [2.0, -2.0], 0.5).mu == pytest.approx(0.2)
-    assert OgdenK2([0.3], [2.0], 0.5).lam + 2 / 3 * 0.3 == pytest.approx(0.5)
+    assert fem.MooneyRivlinK2(0.2, -0.1, 2.0).mu == pytest.approx(0.2)
+    assert fem.YeohK2(0.2, -0.1, -0.1, 2.0).mu == pytest.approx(0.4)
+    assert fem.OgdenK2([0.3, -0.1], [2.0, -2.0], 0.5).mu == pytest.approx(0.2)
+    assert fem.OgdenK2([0.3], [2.0], 0.5).lam + 2 / 3 * 0.3 == pytest.approx(0.5)
+
+
+RATIO, RANGE = "poisson = .* must lie between", "poisson = .* must be a range"
+RATIOS_OUT = [-1.0, 0.5, 0.7, -3.0, math.nan, math.inf, -math.inf]
+ENDS_OUT = [[-1.0, 0.3], [0.2, 0.5], [-2.0, 0.3], [0.2, 0.6]]
+NO_RANGES = [[0.4, 0.2], [0.3, 0.3], [], [0.2], [0.1, 0.2, 0.3], [math.nan, 0.3], [0.2, math.nan]]
+INVALID = [
+    *((kind, (bad,), RATIO) for kind, bad in zip(cycle(HOOKEAN), RATIOS_OUT + ENDS_OUT)),
+    *((kind, (bad,), RANGE) for kind, bad in zip(cycle(HOOKEAN), NO_RANGES)),
+    (fem.MooneyRivlinK2, (0.1, -0.1, 2.0), "c10"),
+    (fem.MooneyRivlinK2, (0.1, -0.2, 2.0), "c10"),
+    (fem.MooneyRivlinK2, (math.nan, 0.1, 2.0), "c10"),
+    (fem.MooneyRivlinK2, (0.1, math.inf, 2.0), "c10"),
+    (fem.MooneyRivlinK2, (0.1, 0.1, 0.0), "bulk"),
+    (fem.MooneyRivlinK2, (0.1, 0.1, math.inf), "bulk"),
+    (fem.YeohK2, (0.0, 0.1, 0.1, 2.0), "c10"),
+    (fem.YeohK2, (-0.1, 0.1, 0.1, 2.0), "c10"),
+    (fem.YeohK2, (0.2, math.nan, 0.1, 2.0), "moduli = .* must be finite"),
+    (fem.YeohK2, (0.2, 0.1, math.inf, 2.0), "moduli = .* must be finite"),
+    (fem.YeohK2, (0.2, 0.1, 0.1, -2.0), "bulk"),
+    (fem.YeohK2, (0.2, 0.1, 0.1, math.nan), "bulk"),
+    (fem.OgdenK2, ([0.1, 0.2], [1.3], 2.0), "exponents"),
+    (fem.OgdenK2, ([0.1], [1.3, 2.0], 2.0), "exponents"),
+    (fem.OgdenK2, ([0.1, 0.2], [1.3, 0.0], 2.0), "exponents"),
+    (fem.OgdenK2, ([0.1], [math.nan], 2.0), "must be finite"),
+    (fem.OgdenK2, ([0.1, -0.2], [1.3, 2.0], 2.0), "shear"),
+    (fem.OgdenK2, ([], [], 2.0), "shear"),
+    (fem.OgdenK2, ([0.1], [2.0], math.inf), "bulk"),
+]
+
+
+@pytest.mark.parametrize(("kind", "constants", "message"), INVALID)
+def test_invalid_constants_are_an_error(kind, constants, message):
+    with pytest.raises(ValueError, match=message):
+        kind(*constants)
+
+
+@pytest.mark.parametrize(
+    "ratios", [[0.5], [-1.0, 0.3], [0.3, 0.5], [0.3, math.nan], [0.3, 0.7], [-2.0, 0.3]]
+)
+def test_parameters_that_the_law_refuses_are_an_error(ratios):
+    with pytest.raises(ValueError, match=RATIO):
+        fem.NeoHookeanLn([0.2, 0.4]).with_parameters(torch.tensor(ratios).double()[:, None])
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-9, 1e-7, 3e-7, 3e-6, 1e-5])
@@ -957,6 +919,6 @@ def test_invariants_are_those_of_the_eigenvalues(gradients):
 
 @pytest.mark.parametrize("J", [-0.5, -1e-3, -2.0])
 def test_ogdens_stress_is_not_a_number_where_a_body_is_inverted(J):
-    law = OgdenK2(shear=[0.4], exponents=[1.5], bulk=2.0)
+    law = fem.OgdenK2(shear=[0.4], exponents=[1.5], bulk=2.0)
     inverted = torch.diag(torch.tensor([J, 1.0, 1.0], dtype=torch.float64)) - torch.eye(3).double()
     assert law.stress(inverted).isnan().all()

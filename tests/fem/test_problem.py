@@ -98,7 +98,7 @@ def test_all_eigenvalues_of_the_hexahedron_are_tabulated():
     K = stiffness(Problem.build(CUBE, NH, length=1.0))
     assert np.linalg.eigvalsh(K)[15:-1] == pytest.approx([0.384615385] * 8, abs=6e-10)
     assert (K**2).sum() == pytest.approx(2.9722770107, abs=6e-11)
-    assert np.linalg.eigvalsh(K)[-1] == pytest.approx((3 * NH.lam + 2 * NH.mu) / 2, rel=1e-12)
+    assert np.linalg.eigvalsh(K)[-1] == pytest.approx(float(3 * NH.lam + 2 * NH.mu) / 2, rel=1e-12)
 
 
 @pytest.mark.parametrize("element", ELEMENTS)

@@ -14,7 +14,7 @@ from dpl.fem.assembly.elements import gradients
 from dpl.fem.assembly.follower_loads import CONSTANT, FollowerLoad, FollowerTerm, Stress
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.identity import plain
-from dpl.fem.materials.fibre_reinforced import FibreDirections, fibre_frames
+from dpl.fem.materials.fibres.reinforced import FibreDirections, fibre_frames
 from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin, Region, cells_in
 from dpl.fem.units import Units

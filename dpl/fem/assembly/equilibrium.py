@@ -83,8 +83,7 @@ class EquilibriumCriterion(TensorAssembly):
         size = self.dN.norm(dim=-1)  # (E or 1, Q, A)
         terms = (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
         modulus = self.material.lam + 2 * self.material.mu
-        moduli = torch.as_tensor(modulus, dtype=terms.dtype, device=terms.device)  # to (B, E, 1)
-        terms = (moduli.reshape((1,) * (3 - moduli.ndim) + moduli.shape) * terms)[..., None]
+        terms = (modulus.to(terms) * terms[None])[..., None]  # (B or 1, E, A, 1)
         terms = terms.expand(-1, len(self.cells), -1, self.shape[1])
         summed = self._sum_at_nodes(terms)[..., 0]
         summed = torch.where(self.free.any(dim=1), summed, 0.0)

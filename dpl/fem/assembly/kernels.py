@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpl.fem.assembly import element_loops
-from dpl.fem.assembly.numba_laws import CompiledLaw, Law, required_terms
+from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
-from dpl.fem.materials.fibre_reinforced import FibreReinforced
+from dpl.fem.materials.material import CompiledForm, Material
 
 Array = NDArray[np.float64]
 Gap = Array | tuple[Array, Array]  # of strains, with mean dilatation of strains and volume changes
@@ -31,7 +31,7 @@ class Kernels:
 
     def __init__(
         self,
-        material: CompiledLaw,
+        material: Material,
         cells: NDArray[np.int64],
         dN: Array,
         dV: Array,
@@ -41,7 +41,7 @@ class Kernels:
         """Store the arrays; numba compiles at the first call and caches the code on disk.
 
         Args:
-            material: The law.
+            material: The law, which has a `compiled_form`.
             cells: Nodes of each cell, (E, A).
             dN: Gradients of the shape functions, (E or 1, Q, A, D).
             dV: Volumes of the quadrature points, (E or 1, Q).
@@ -54,19 +54,20 @@ class Kernels:
         self.dV = dV
         self.places = _in_blocks(places)
         self.functions = None if functions is None else np.ascontiguousarray(functions)
+        form = form_of(material)
         self._law = (
-            Law.of(material, element_loops.SOURCES),
-            max(required_terms(material), int(functions is not None and material.finite)),
+            Law.of(form, element_loops.SOURCES),
+            max(required_terms(form), int(functions is not None and material.finite)),
             float(material.finite),
         )
         self._set_constants(material)
 
-    def _set_constants(self, material: CompiledLaw) -> None:
+    def _set_constants(self, material: Material) -> None:
         self._constants = as_columns(material.constants)
         self._frames = frames_of(material)
         self._bulk = None if self.functions is None else as_columns([material.point_bulk])
 
-    def with_moduli(self, materials: Sequence[CompiledLaw]) -> "Kernels":
+    def with_moduli(self, materials: Sequence[Material]) -> "Kernels":
         """Return the kernels of the same body with other moduli of its one law."""
         other = copy.copy(self)
         other._set_constants(*materials)
@@ -122,7 +123,7 @@ class GroupedKernels:
         """Take the kernels of the groups."""
         self._groups = groups
 
-    def with_moduli(self, materials: Sequence[CompiledLaw]) -> "GroupedKernels":
+    def with_moduli(self, materials: Sequence[Material]) -> "GroupedKernels":
         """Return the kernels of the same body with other moduli of the same laws."""
         pairs = zip(self._groups, materials, strict=True)
         return GroupedKernels([kernels.with_moduli([material]) for kernels, material in pairs])
@@ -153,7 +154,14 @@ def _both(gap: Gap | None) -> tuple[Array, Array]:
     return NO_GAP if gap is None else gap, NO_VOLUME_GAP
 
 
-def constants_of(material: CompiledLaw) -> Array:
+def form_of(material: Material) -> CompiledForm:
+    """Return the compiled form of a law that has one."""
+    form = material.compiled_form
+    assert form is not None
+    return form
+
+
+def constants_of(material: Material) -> Array:
     """Return the constants of a law with one frame in each cell, (B or 1, E or 1, n).
 
     The entries of the frames, row by row, follow the other constants.
@@ -161,22 +169,22 @@ def constants_of(material: CompiledLaw) -> Array:
     return as_columns([*material.constants, *frames_of(material)[:, 0].T[..., None]])
 
 
-def frames_of(material: CompiledLaw) -> Array:
+def frames_of(material: Material) -> Array:
     """Return the fibre frames of a law, (E or 1, Q or 1, 9), or (1, 1, 0) without fibres.
 
     They are a copy: sending a problem to a worker moves the memory of its tensors.
     """
-    if not isinstance(material, FibreReinforced):
+    frames = form_of(material).frames
+    if frames is None:
         return np.zeros((1, 1, 0))
-    frames = material.frames if material.frames.ndim == 4 else material.frames[:, None]
     return frames.flatten(2).contiguous().numpy().copy()
 
 
 def as_columns(values: Sequence[Any]) -> Array:
-    """Return numbers, fields or values of a batch as (B or 1, E or 1, n)."""
+    """Return numbers and tensors of cells or of a batch as (B or 1, E or 1, n)."""
     columns = [np.asarray(value, dtype=np.float64) for value in values]
-    columns = [c.reshape((1,) * (3 - c.ndim) + c.shape) for c in columns]
-    return np.ascontiguousarray(np.concatenate(np.broadcast_arrays(*columns), axis=-1))
+    full = np.broadcast_arrays(*columns, np.zeros((1, 1, 1)))[:-1]
+    return np.ascontiguousarray(np.concatenate(full, axis=-1))
 
 
 PATIENCE = 2.0  # time after which a compilation is announced [s]

@@ -13,11 +13,7 @@ from numba.extending import NativeValue, models, overload, register_model, typeo
 
 from dpl.fem.assembly.simd import load, store
 from dpl.fem.materials import arithmetic
-from dpl.fem.materials.fibre_energies import FibreEnergy
-from dpl.fem.materials.fibre_reinforced import FibreReinforced
-from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-
-CompiledLaw = InvariantBasedMaterial | FibreReinforced
+from dpl.fem.materials.material import CompiledForm
 
 
 class _LawType(types.Type):
@@ -40,25 +36,24 @@ class Law:
         material: Class of the isotropic law.
         n_constants: Number of its constants.
         sources: Source code of the kernels, for the digest.
-        fibres: Class of the energy of fibres, or None.
+        fibres: Class of the energy of fibres, see `CompiledForm`, or None.
         n_fibre_constants: Number of its constants. They follow those of the isotropic law, and the
             entries of the fibre frame, row by row, follow them.
     """
 
-    material: type[InvariantBasedMaterial]
+    material: type[Any]
     n_constants: int
     sources: str
-    fibres: type[FibreEnergy] | None = None
+    fibres: type[Any] | None = None
     n_fibre_constants: int = 0
 
     @classmethod
-    def of(cls, material: CompiledLaw, sources: str) -> "Law":
+    def of(cls, form: CompiledForm, sources: str) -> "Law":
         """Return a law as an argument of a kernel."""
-        if isinstance(material, FibreReinforced):
-            matrix, fibres = material.matrix, material.fibres
-            counts = len(matrix.constants), len(fibres.constants)
-            return cls(type(matrix), counts[0], sources, type(fibres), counts[1])
-        return cls(type(material), len(material.constants), sources)
+        law, fibres = form.isotropic, form.fibres
+        counts = len(law.constants), 0 if fibres is None else len(fibres.constants)
+        kind = None if fibres is None else type(fibres)
+        return cls(type(law), counts[0], sources, kind, counts[1])
 
     @cached_property
     def kind(self) -> _LawType:
@@ -115,15 +110,14 @@ def _call_of_fibres(function: Any, rows: range) -> Any:
     return scope["call"]
 
 
-def required_terms(material: CompiledLaw) -> int:
+def required_terms(form: CompiledForm) -> int:
     """Return the terms that a law needs: 0 no C^-1, 1 C^-1, 2 also ln J, 3 also J^(-2/3)."""
-    if isinstance(material, FibreReinforced):
-        material = material.matrix
-    constants = tuple(float(torch.as_tensor(c).flatten()[0]) for c in material.constants)
+    law = form.isotropic
+    constants = tuple(float(torch.as_tensor(c).flatten()[0]) for c in law.constants)
 
     def evaluate(**values: float) -> tuple[float, ...]:
         arguments = dict.fromkeys(("i1", "i2", "j", "log_j", "m1"), 0.0) | values
-        return material.invariant_derivatives(constants, **arguments)
+        return law.invariant_derivatives(constants, **arguments)
 
     if np.isnan(evaluate(m1=np.nan)).any():
         return 3

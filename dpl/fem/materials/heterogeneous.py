@@ -15,7 +15,6 @@ from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import Material, Response
 from dpl.fem.materials.parameters import Composed
 from dpl.fem.mesh.regions import Origin, Region, Tag, cells_in
-from dpl.fem.ranges import ParameterRange
 
 OTHER = "other"  # region of the cells that belong to no other region
 
@@ -42,7 +41,6 @@ class Heterogeneous(Composed, Material):
     layout: "Layout | None" = None
 
     def __post_init__(self) -> None:
-        """Check the laws."""
         if not self.laws:
             raise ValueError("material: there is no law; give at least one region a law")
         if len({law.finite for law in self.laws.values()}) > 1:
@@ -54,7 +52,7 @@ class Heterogeneous(Composed, Material):
 
     @property
     def finite(self) -> bool:  # type: ignore[override]
-        """See `Material.finite`."""
+        """False for laws of small strains."""
         return all(law.finite for law in self.laws.values())
 
     # ------------------------------------------------------------------ cells
@@ -93,7 +91,6 @@ class Heterogeneous(Composed, Material):
         return replace(bound, layout=layout)
 
     def of_cells(self, cells: Tensor) -> Self:
-        """See `Material.of_cells`."""
         layout = Layout.of(self.laws.values(), self._layout.law_of_cell[cells])
         return replace(super().of_cells(cells), layout=layout)
 
@@ -104,43 +101,38 @@ class Heterogeneous(Composed, Material):
         return self.layout
 
     def groups(self, count: int) -> list[tuple[Material, Tensor]]:
-        """See `Material.groups`."""
         return self._groups
 
     @cached_property
     def _groups(self) -> list[tuple[Material, Tensor]]:
         """Laws that are evaluated together and their cells, in ascending order."""
-        laws = list(self.laws.values())
+        laws, index = list(self.laws.values()), self._layout.law_of_cell
         return [
-            (merge_laws([laws[k] for k in numbers], parts, order), cells)
-            for numbers, parts, order, cells in self._layout.groups
+            (merge_laws([laws[k] for k in numbers], numbers, index, cells), cells)
+            for numbers, cells in self._layout.groups
         ]
 
     # ------------------------------------------------------------------ parameters
 
     @property
     def parts(self) -> Mapping[str, Material]:
-        """See `Composed.parts`."""
         return self.laws
 
     def with_parts(self, parts: Mapping[str, Any]) -> Self:
-        """See `Composed.with_parts`."""
         return replace(self, laws=parts)
 
     def identity(self) -> dict[str, Any]:
-        """See `Material.identity`; of the regions, the cells count and not their definition."""
+        """Return laws and cells as plain data; the definition of the regions does not count."""
         laws = {name: law.identity() for name, law in self.laws.items()}
         return {"name": type(self).__name__, "laws": laws, "cells": plain(self._layout.law_of_cell)}
 
     def describe(self) -> str:
-        """See `Material.describe`."""
         return "; ".join(f"{name}: {law.describe()}" for name, law in self.laws.items())
 
     # ------------------------------------------------------------------ evaluation
 
     @property
     def has_response(self) -> bool:
-        """See `Material.has_response`."""
         return all(law.has_response for law in self.laws.values())
 
     def energy(self, H: Tensor) -> Tensor:
@@ -148,11 +140,9 @@ class Heterogeneous(Composed, Material):
         return self._of_all_cells(lambda law, H: law.energy(H), H)
 
     def volumetric_energy(self, j: Tensor) -> Tensor:
-        """See `Material.volumetric_energy`."""
         return self._of_all_cells(lambda law, j: law.volumetric_energy(j), j)
 
     def pressure(self, j: Tensor) -> Tensor:
-        """See `Material.pressure`."""
         return self._of_all_cells(lambda law, j: law.pressure(j), j)
 
     def stress(self, H: Tensor) -> Tensor:
@@ -182,41 +172,27 @@ class Heterogeneous(Composed, Material):
         return torch.cat(parts, dim=1)[:, self._layout.order]
 
     @property
-    def rest_moduli(self) -> Tensor:
-        """See `Material.rest_moduli`; those of the laws one after the other."""
-        parts = [law.rest_moduli for law in self.laws.values()]
-        batch = torch.broadcast_shapes(*(part.shape[:1] for part in parts))
-        return torch.cat([part.expand(*batch, -1) for part in parts], dim=1)
-
-    def linear_law(self, moduli: Tensor) -> "Heterogeneous":
-        """See `Material.linear_law`."""
-        counts = [law.rest_moduli.shape[1] for law in self.laws.values()]
-        parts = zip(self.laws.items(), moduli.split(counts), strict=True)
-        return replace(self, laws={name: law.linear_law(own) for (name, law), own in parts})
-
-    @property
     def largest_poisson_ratio(self) -> float:
-        """See `Material.largest_poisson_ratio`."""
         return max(law.largest_poisson_ratio for law in self.laws.values())
 
     @property
-    def mu(self) -> Tensor:  # type: ignore[override]
+    def mu(self) -> Tensor:
         """Shear modulus at rest over Young's modulus of the cells, (E, 1) or (B, E, 1) [-]."""
         return self._moduli(lambda law: law.mu)
 
     @property
-    def lam(self) -> Tensor:  # type: ignore[override]
+    def lam(self) -> Tensor:
         """First Lame parameter at rest over Young's modulus, (E, 1) or (B, E, 1) [-]."""
         return self._moduli(lambda law: law.lam)
 
     @property
     def point_bulk(self) -> Tensor:
-        """See `Material.point_bulk`, (E, 1) or (B, E, 1) [-]."""
+        """Bulk modulus that stays at the points, (E, 1) or (B, E, 1) [-]."""
         return self._moduli(lambda law: law.point_bulk)
 
-    def _moduli(self, of: Callable[[Material], Any]) -> Tensor:
-        parts = [as_field(of(law), len(cells)) for law, cells in self._groups]
-        return join_fields(parts)[..., self._layout.order, :]
+    def _moduli(self, of: Callable[[Material], Tensor]) -> Tensor:
+        index = self._layout.law_of_cell
+        return values_of_cells([of(law) for law in self.laws.values()], index)
 
 
 class Layout(NamedTuple):
@@ -224,13 +200,12 @@ class Layout(NamedTuple):
 
     Attributes:
         law_of_cell: Number of the law of each cell, (E,).
-        groups: For each group of laws of one class their numbers, the cells of each, the order that
-            sorts these, and all cells of the group in ascending order.
+        groups: For each group of laws of one class their numbers and their cells, both ascending.
         order: Position of each cell in the cells of the groups, (E,).
     """
 
     law_of_cell: Tensor
-    groups: tuple[tuple[list[int], list[Tensor], Tensor, Tensor], ...]
+    groups: tuple[tuple[list[int], Tensor], ...]
     order: Tensor
 
     @classmethod
@@ -241,12 +216,10 @@ class Layout(NamedTuple):
             if (index == k).any():
                 key = type(law) if isinstance(law, InvariantBasedMaterial) else k
                 numbers.setdefault(key, []).append(k)
-        groups = []
-        for own in numbers.values():
-            parts = [(index == k).nonzero()[:, 0] for k in own]
-            order = torch.cat(parts).argsort()
-            groups.append((own, parts, order, torch.cat(parts)[order]))
-        return cls(index, tuple(groups), torch.cat([cells for *_, cells in groups]).argsort())
+        groups = tuple(
+            (own, torch.isin(index, torch.tensor(own)).nonzero()[:, 0]) for own in numbers.values()
+        )
+        return cls(index, groups, torch.cat([cells for _, cells in groups]).argsort())
 
 
 def one_law(material: Material) -> Material:
@@ -256,38 +229,28 @@ def one_law(material: Material) -> Material:
     return material
 
 
-def as_field(value: Any, count: int) -> Tensor:
-    """Return a constant as a field of cells, (E, 1), or of a batch, (B, E, 1)."""
-    tensor = torch.as_tensor(value, dtype=torch.float64)
-    tensor = tensor.reshape((1,) * (2 - tensor.ndim) + tensor.shape)
-    return tensor.expand(*tensor.shape[:-2], count, 1)
-
-
-def join_fields(fields: Sequence[Tensor]) -> Tensor:
-    """Return fields of groups of cells, (E, 1) or (B, E, 1), as one field of all these cells."""
-    batch = torch.broadcast_shapes(*(field.shape[:-2] for field in fields))
-    return torch.cat([field.expand(*batch, *field.shape[-2:]) for field in fields], dim=-2)
-
-
-def merge_laws(laws: Sequence[Material], parts: Sequence[Tensor], order: Tensor) -> Material:
-    """Return laws of one class on different cells as one law with fields.
+def values_of_cells(values: Sequence[Tensor], index: Tensor) -> Tensor:
+    """Return for each cell the value of its law, (E, 1) or (B, E, 1).
 
     Args:
-        laws: The laws.
-        parts: Cells of each.
-        order: Order of all these cells in the result.
+        values: Constant of each law in all cells, (), (E, 1), (B, 1, 1) or (B, E, 1).
+        index: Number of the law of each cell, (E,).
     """
-    laws = [law.of_cells(cells) for law, cells in zip(laws, parts, strict=True)]
+    full = torch.broadcast_tensors(*values, torch.empty(len(index), 1))[:-1]
+    return torch.stack(full, dim=-3)[..., index, torch.arange(len(index)), :]
+
+
+def merge_laws(
+    laws: Sequence[Material], numbers: Sequence[int], law_of_cell: Tensor, cells: Tensor
+) -> Material:
+    """Return laws of one class as one law of their cells (C,), whose constants are fields."""
     if len(laws) == 1:
-        return laws[0]
-    values: dict[str, Any] = {}
-    for name in laws[0].ranged:
-        own = [getattr(law, name) for law in laws]
-        if ranges := [value for value in own if isinstance(value, ParameterRange)]:
-            values[name] = ranges[0]  # such a law has no moduli yet
-        elif any(isinstance(value, Tensor) for value in own) or len(set(own)) > 1:
-            columns = [as_field(v, len(cells)) for v, cells in zip(own, parts, strict=True)]
-            values[name] = join_fields(columns)[..., order, :]
-        else:
-            values[name] = own[0]
-    return replace(cast("Any", laws[0]), **values)
+        return laws[0].of_cells(cells)
+    ranges = {name: ends for law in laws for name, ends in law.parameter_ranges.items()}
+    constants: dict[str, Any] = dict(ranges)  # such a law has no moduli yet
+    index = torch.searchsorted(torch.tensor(numbers), law_of_cell.clamp(max=numbers[-1]))
+    for name in set(laws[0].ranged) - set(ranges):
+        own = [law.value(name) for law in laws]
+        if not all(value.ndim == 0 and value == own[0] for value in own):
+            constants[name] = values_of_cells(own, index)[..., cells, :]
+    return replace(cast("Any", laws[0]), **constants)

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.material import Material, Response
+from dpl.fem.materials.material import CompiledForm, Material, Response
 from dpl.fem.materials.tensors import (
     dyad,
     green_lagrange,
@@ -13,6 +13,7 @@ from dpl.fem.materials.tensors import (
     inverse_transpose,
     symmetric_product,
     volume_change,
+    with_axes,
 )
 
 
@@ -28,9 +29,9 @@ class InvariantBasedMaterial(Material):
     """
 
     @property
-    def constants(self) -> tuple[float, ...]:
-        """Moduli that `invariant_derivatives` takes."""
-        raise NotImplementedError
+    def compiled_form(self) -> CompiledForm:
+        """The law alone, without fibres."""
+        return CompiledForm(self)
 
     @staticmethod
     def invariant_derivatives(
@@ -66,10 +67,7 @@ class InvariantBasedMaterial(Material):
         X = inverse_transpose(e, square)
         invariant_derivatives = self._invariant_derivatives(i1, 2 * i1 + second, j)
         S = _stress(e, square, i1, invariant_derivatives)
-        _, W2, p, *curvatures = (
-            s[..., None, None, None, None] if isinstance(s, Tensor) else s
-            for s in invariant_derivatives
-        )
+        _, W2, p, *curvatures = (with_axes(s, 4) for s in invariant_derivatives)
         W11, W12, W22, W1J, W2J, pJ = curvatures
         T1, T2 = 2 * eye.expand_as(e), 2 * ((2 + i1)[..., None, None] * eye - e)
         D = W11 * dyad(T1, T1) + W22 * dyad(T2, T2) + pJ * dyad(X, X)
@@ -101,9 +99,7 @@ def _stress(
     e: Tensor, square: Tensor, i1: Tensor, invariant_derivatives: tuple[Tensor | float, ...]
 ) -> Tensor:
     """Return S (..., 3, 3) at e = 2 E = C - I with det C = 1 + square."""
-    rest, W2, p = (
-        s[..., None, None] if isinstance(s, Tensor) else s for s in invariant_derivatives[:3]
-    )
+    rest, W2, p = (with_axes(s, 2) for s in invariant_derivatives[:3])
     eye = torch.eye(3, dtype=e.dtype, device=e.device)
     S = (rest + 2 * W2 * i1[..., None, None]) * eye
     if isinstance(W2, Tensor) or W2:

@@ -1,34 +1,21 @@
-"""Derivatives of energies that are functions of isochoric invariants."""
+"""Laws of the isochoric invariants Ib1 = J^(-2/3) I1 and Ib2 = J^(-4/3) I2 and of the volume."""
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.tensors import (
-    green_lagrange,
-    invariants,
-    volume_change,
-)
-
-
-def polynomial_derivatives(c: Any, i1: Any, i2: Any, m1: Any, q: Any, qJ: Any) -> tuple[Any, ...]:
-    """Return `invariant_derivatives` of c0 x + c1 x^2 + c2 x^3 + c3 y + U(J).
-
-    Here x = Ib1 - 3 and y = Ib2 - 3.
-
-    Args:
-        c: Moduli.
-        i1, i2, m1: As in `InvariantBasedMaterial.invariant_derivatives`.
-        q, qJ: J U' and J (J U')'.
-    """
-    x = (1 + m1) * i1 + 3 * m1
-    f1, f11 = c[0] + x * (2 * c[1] + 3 * c[2] * x), 2 * c[1] + 6 * c[2] * x
-    return isochoric_derivatives(f1, f11, c[3], i1, i2, m1, q, qJ)
+from dpl.fem.materials.arithmetic import exp
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.material import check_moduli
+from dpl.fem.materials.parameters import Constant
+from dpl.fem.materials.tensors import green_lagrange, invariants, volume_change
+from dpl.fem.materials.volumetric import k2_derivatives
 
 
 def isochoric_derivatives(
-    f1: Any, f11: Any, f2: Any, i1: Any, i2: Any, m1: Any, q: Any, qJ: Any
+    f1: Any, f11: Any, f2: Any, i1: Any, i2: Any, m1: Any, volumetric: tuple[Any, Any]
 ) -> tuple[Any, ...]:
     """Return `invariant_derivatives` of f(x) + f2 y + U(J), x = Ib1 - 3 and y = Ib2 - 3.
 
@@ -36,8 +23,9 @@ def isochoric_derivatives(
         f1, f11: f' and f''.
         f2: Factor of y.
         i1, i2, m1: As in `InvariantBasedMaterial.invariant_derivatives`.
-        q, qJ: J U' and J (J U')'.
+        volumetric: J U' and J (J U')'.
     """
+    q, qJ = volumetric
     m = 1 + m1
     x = m * i1 + 3 * m1
     I1, I2 = x + 3, m * m * (3 + i2)  # of the isochoric part
@@ -47,6 +35,18 @@ def isochoric_derivatives(
     W1J = -2 / 3 * m * (f1 + f11 * I1)
     pJ = qJ + 4 / 9 * I1 * (f1 + f11 * I1) + 16 / 9 * f2 * I2
     return rest, W2, p, f11 * m * m, 0.0, W22, W1J, -4 / 3 * W2, pJ
+
+
+def polynomial_derivatives(
+    c: Any, i1: Any, i2: Any, m1: Any, volumetric: tuple[Any, Any]
+) -> tuple[Any, ...]:
+    """Return `invariant_derivatives` of c0 x + c1 x^2 + c2 x^3 + c3 y + U(J).
+
+    Arguments are those of `isochoric_derivatives`, c are moduli.
+    """
+    x = (1 + m1) * i1 + 3 * m1
+    f1, f11 = c[0] + x * (2 * c[1] + 3 * c[2] * x), 2 * c[1] + 6 * c[2] * x
+    return isochoric_derivatives(f1, f11, c[3], i1, i2, m1, volumetric)
 
 
 def isochoric_invariants(H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -61,3 +61,152 @@ def isochoric_invariants(H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         n * i2 + 3 * torch.expm1(-4 / 3 * log_j),
         j,
     )
+
+
+class PolynomialMaterial(InvariantBasedMaterial):
+    """Law c10 x + c20 x^2 + c30 x^3 + c01 y + bulk/2 (J - 1)^2, x = Ib1 - 3 and y = Ib2 - 3.
+
+    Its `constants` are c10, c20, c30, c01 and bulk over E [-]. The shear modulus at rest is
+    2 (c10 + c01). The volumetric term is that of Abaqus (D1 = 2/bulk).
+    """
+
+    shear_name: ClassVar[str]  # of the shear modulus at rest, in a message
+
+    def check_constants(self) -> None:
+        """Check that the body resists shear and compression."""
+        numbers = list(map(float, self.constants))
+        check_moduli(self.shear_name, 2 * (numbers[0] + numbers[3]), numbers[4], numbers)
+
+    @property
+    def mu(self) -> Tensor:
+        """Shear modulus at rest over Young's modulus [-]."""
+        c10, _, _, c01, _ = self.constants
+        return 2 * (c10 + c01)
+
+    @property
+    def lam(self) -> Tensor:
+        """First Lame parameter at rest over Young's modulus [-]."""
+        return self.constants[4] - 2 / 3 * self.mu
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        i1, i2, j = isochoric_invariants(H)
+        c10, c20, c30, c01, bulk = self.constants
+        return i1 * (c10 + i1 * (c20 + i1 * c30)) + c01 * i2 + bulk / 2 * j.square()
+
+    @staticmethod
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
+        return polynomial_derivatives(c, i1, i2, m1, k2_derivatives(c[4], j))
+
+
+@dataclass(frozen=True)
+class MooneyRivlinK2(PolynomialMaterial):
+    """Mooney-Rivlin solid: c10 (Ib1 - 3) + c01 (Ib2 - 3) + bulk/2 (J - 1)^2.
+
+    Shear modulus at rest 2 (c10 + c01).
+
+    Source: Rivlin (1948); the volumetric term is that of Abaqus (D1 = 2/bulk).
+
+    Attributes:
+        c10, c01, bulk: Moduli over E [-]; numbers, ranges [low, high] or fields.
+    """
+
+    ranged: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk")
+    shear_name: ClassVar[str] = "2 (c10 + c01)"
+
+    c10: Constant
+    c01: Constant
+    bulk: Constant
+
+    @property
+    def constants(self) -> tuple[Tensor, ...]:
+        """Return c10, 0, 0, c01 and bulk."""
+        c10, c01, bulk = super().constants
+        return c10, 0 * c10, 0 * c10, c01, bulk
+
+
+@dataclass(frozen=True)
+class YeohK2(PolynomialMaterial):
+    """Yeoh's solid: c10 (Ib1 - 3) + c20 (Ib1 - 3)^2 + c30 (Ib1 - 3)^3 + bulk/2 (J - 1)^2.
+
+    Source: Yeoh (1993), Rubber Chem. Technol. 66; the volumetric term is that of Abaqus.
+
+    Attributes:
+        c10, c20, c30, bulk: Moduli over E [-]; numbers, ranges [low, high] or fields. The shear
+            modulus at rest is 2 c10.
+    """
+
+    ranged: ClassVar[tuple[str, ...]] = ("c10", "c20", "c30", "bulk")
+    shear_name: ClassVar[str] = "2 c10"
+
+    c10: Constant
+    c20: Constant
+    c30: Constant
+    bulk: Constant
+
+    @property
+    def constants(self) -> tuple[Tensor, ...]:
+        """Return c10, c20, c30, 0 and bulk."""
+        c10, c20, c30, bulk = super().constants
+        return c10, c20, c30, 0 * c10, bulk
+
+
+@dataclass(frozen=True)
+class DemirayK2(InvariantBasedMaterial):
+    """Demiray's solid: a/(2 b) (exp(b (Ib1 - 3)) - 1) + bulk/2 (J - 1)^2.
+
+    Shear modulus at rest a. It is the isotropic part of `HolzapfelOgdenFibres`.
+
+    Source: Demiray (1972), J. Biomech. 5; in this form Holzapfel, Ogden (2009), Phil. Trans. R.
+    Soc. A 367. The volumetric term is that of Abaqus.
+
+    Attributes:
+        a: Shear modulus over E [-].
+        b: Exponent [-].
+        bulk: Bulk modulus over E [-].
+    """
+
+    ranged: ClassVar[tuple[str, ...]] = ("a", "b", "bulk")
+
+    a: Constant
+    b: Constant
+    bulk: Constant
+
+    def check_constants(self) -> None:
+        """Check that the body resists shear and compression, and the exponent."""
+        check_moduli("a", self.a, self.bulk, (self.a, self.b, self.bulk))
+        if not self.b > 0:
+            raise ValueError(f"b = {self.b} must be above 0")
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        i1, _, j = isochoric_invariants(H)
+        half, b, bulk = self.constants
+        return half / b * torch.expm1(b * i1) + bulk / 2 * j.square()
+
+    @property
+    def constants(self) -> tuple[Tensor, ...]:
+        """Return a/2, b and bulk."""
+        a, b, bulk = super().constants
+        return a / 2, b, bulk
+
+    @property
+    def mu(self) -> Tensor:
+        """Shear modulus at rest over Young's modulus [-]."""
+        return self.value("a")
+
+    @property
+    def lam(self) -> Tensor:
+        """First Lame parameter at rest over Young's modulus [-]."""
+        return self.value("bulk") - 2 / 3 * self.mu
+
+    @staticmethod
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
+        f1 = c[0] * exp(c[1] * ((1 + m1) * i1 + 3 * m1))
+        return isochoric_derivatives(f1, c[1] * f1, 0.0, i1, i2, m1, k2_derivatives(c[2], j))

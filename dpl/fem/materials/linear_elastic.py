@@ -1,35 +1,61 @@
-"""Linear elasticity of small strains, as a reference."""
+"""Hooke's law of small strains, and of the Green-Lagrange strain (Saint Venant-Kirchhoff)."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import singledispatch
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import YoungPoissonMaterial
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.materials.parameters import Composed
 from dpl.fem.materials.tensors import (
-    broadcast_modulus,
     dyad,
+    green_lagrange,
     symmetric_product,
     trace,
+    with_axes,
 )
 
 
 class Hookean(InvariantBasedMaterial):
+    """Law with the constants lambda and mu, whose derivatives are those of Hooke's energy."""
+
+    @property
+    def constants(self) -> tuple[Tensor, ...]:
+        """Return lambda and mu."""
+        return self.lam, self.mu
+
+    @staticmethod
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
+        rest = (c[0] / 2 + c[1]) * i1
+        return rest, -c[1] / 2, 0.0, c[0] / 4 + c[1] / 2, 0.0, 0.0, 0.0, 0.0, 0.0
+
+
+@dataclass(frozen=True)
+class SaintVenantKirchhoff(YoungPoissonMaterial, Hookean):
+    """Saint Venant-Kirchhoff solid SVK: lambda/2 (tr E)^2 + mu E:E, E = (F^T F - I)/2.
+
+    Source: Bonet, Wood (2008), eq. 6.28. It softens in compression: no answer need exist there.
+    """
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        E = green_lagrange(H)
+        return self.lam / 2 * trace(E).square() + self.mu * E.square().sum((-2, -1))
+
+
+class SmallStrains(Hookean):
     """Linear elasticity: lambda/2 (tr eps)^2 + mu eps:eps, eps = (H + H^T)/2.
 
     Source: Bonet, Wood (2008), eq. 6.29 at small strains.
     """
 
     finite: ClassVar[bool] = False
-    invariant_derivatives = staticmethod(SaintVenantKirchhoff.invariant_derivatives)
-
-    @property
-    def constants(self) -> tuple[float, ...]:
-        """Return lambda and mu."""
-        return self.lam, self.mu
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
@@ -38,16 +64,13 @@ class Hookean(InvariantBasedMaterial):
 
     def stress(self, H: Tensor) -> Tensor:
         """Return lambda tr eps I + 2 mu eps, see `Material.stress`."""
-        eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        return (self.lam * trace(H))[..., None, None] * eye + broadcast_modulus(self.mu, 2) * (
-            H + H.mT
-        )
+        return self.rest_stress(H)
 
     def tangent(self, H: Tensor) -> Tensor:
         """Return Hooke's moduli, see `Material.tangent`."""
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        hooke = broadcast_modulus(self.lam, 4) * dyad(eye, eye)
-        hooke = hooke + 2 * broadcast_modulus(self.mu, 4) * symmetric_product(eye)
+        hooke = with_axes(self.lam, 4) * dyad(eye, eye)
+        hooke = hooke + 2 * with_axes(self.mu, 4) * symmetric_product(eye)
         return hooke.expand(*H.shape, 3, 3)
 
     @property
@@ -57,7 +80,7 @@ class Hookean(InvariantBasedMaterial):
 
 
 @dataclass(frozen=True)
-class LinearElastic(YoungPoissonMaterial, Hookean):
+class LinearElastic(YoungPoissonMaterial, SmallStrains):
     """Linear elasticity of small strains.
 
     Exact where rotations are small. The tangent does not depend on the displacement: one Newton
@@ -67,7 +90,7 @@ class LinearElastic(YoungPoissonMaterial, Hookean):
 
 
 @dataclass(frozen=True)
-class LameElastic(Hookean):
+class LameElastic(SmallStrains):
     """Linear elasticity with any Lame parameters, a term of a stiffness; see `StiffnessTerms`.
 
     Attributes:
@@ -76,15 +99,31 @@ class LameElastic(Hookean):
 
     ranged: ClassVar[tuple[str, ...]] = ("shear", "first")
 
-    shear: float
-    first: float
+    shear: float | Tensor
+    first: float | Tensor
 
     @property
-    def mu(self) -> float:
+    def mu(self) -> Tensor:
         """Shear modulus over Young's modulus [-]."""
-        return self.shear
+        return self.value("shear")
 
     @property
-    def lam(self) -> float:
+    def lam(self) -> Tensor:
         """First Lame parameter over Young's modulus [-]."""
-        return self.first
+        return self.value("first")
+
+
+@singledispatch
+def linear_law(law: Any, moduli: Tensor) -> Any:
+    """Return the law of small strains with moduli in the order of `rest_moduli`, (M,).
+
+    A part of a law with moduli of its own registers a function.
+    """
+    return LameElastic(*moduli.view(2, -1, 1))
+
+
+@linear_law.register
+def _of_parts(law: Composed, moduli: Tensor) -> Composed:
+    counts = [part.rest_moduli.shape[1] for part in law.parts.values()]
+    parts = zip(law.parts.items(), moduli.split(counts), strict=True)
+    return law.with_parts({name: linear_law(part, own) for (name, part), own in parts})

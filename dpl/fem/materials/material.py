@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dpl.fem.identity import identity_of
 from dpl.fem.materials.parameters import Constant, Parametrised
-from dpl.fem.materials.tensors import broadcast_modulus, green_lagrange, trace
+from dpl.fem.materials.tensors import green_lagrange, trace, with_axes
 
 
 class Response(NamedTuple):
@@ -42,6 +42,20 @@ class Response(NamedTuple):
         return A + torch.einsum("ik,...JL->...iJkL", eye, self.stress)
 
 
+class CompiledForm(NamedTuple):
+    """A law as compiled loops take it: functions of its `constants` in plain arithmetic.
+
+    Attributes:
+        isotropic: Law with `invariant_derivatives`, see `InvariantBasedMaterial`.
+        fibres: Part with `strain_derivatives`, see `FibreEnergy`, whose constants follow; or None.
+        frames: Frames of the fibres, (E or 1, Q or 1, 3, 3) [-]; None without fibres.
+    """
+
+    isotropic: Any
+    fibres: Any = None
+    frames: Tensor | None = None
+
+
 class Material(Parametrised):
     """Hyperelastic law, its moduli over Young's modulus E.
 
@@ -49,8 +63,7 @@ class Material(Parametrised):
     may give its `response` to strains as well: the two then follow from that, and Newton can take
     strains as unknowns. A law of the invariants (`InvariantBasedMaterial`) is compiled too.
 
-    Strains of a law with fields or of a batch are (B, E, Q, 3, 3), see `Parametrised`. A law with
-    ranges must have `mu` and `lam` as functions of its constants.
+    Strains of a law with fields or of a batch are (B, E, Q, 3, 3), see `Parametrised`.
 
     Attributes:
         finite: False for the one law whose strain is the symmetric part of H.
@@ -80,17 +93,18 @@ class Material(Parametrised):
         if self.has_response:
             S = self.response(green_lagrange(H)).stress
             return S + H @ S
-        if self.is_batched:
-            return torch.func.grad(lambda G: self.energy(G).sum())(H)
-        gradient = torch.func.vmap(torch.func.grad(self.energy))
-        return gradient(H.reshape(-1, 3, 3)).reshape(H.shape)
+        return torch.func.grad(lambda G: self.energy(G).sum())(H)
 
     def tangent(self, H: Tensor) -> Tensor:
         """Return dP/dF over E, (..., 3, 3, 3, 3) [-], indexed iJkL."""
         if self.has_response:
             return self.response(green_lagrange(H)).tangent(H)
-        hessian = torch.func.vmap(torch.func.hessian(self.energy))
-        return hessian(H.reshape(-1, 3, 3)).reshape(*H.shape, 3, 3)
+
+        def slope(direction: Tensor) -> Tensor:
+            return torch.func.jvp(self.stress, (H,), (direction.expand_as(H),))[1]
+
+        directions = torch.eye(9, dtype=H.dtype, device=H.device).unflatten(-1, (3, 3))
+        return torch.func.vmap(slope, out_dims=-1)(directions).unflatten(-1, (3, 3))
 
     def volumetric_energy(self, j: Tensor) -> Tensor:
         """Return U(J), the energy density over E of F = J^(1/3) I, (...,) [-], at J - 1 = j.
@@ -105,19 +119,23 @@ class Material(Parametrised):
         return self.stress(H)[..., 0, 0] / stretch.square()
 
     @property
-    def point_bulk(self) -> Any:
+    def point_bulk(self) -> Tensor:
         """Bulk modulus over E that mean dilatation leaves to the quadrature points [-].
 
-        A number, (E, 1) or (B, E or 1, 1). Zero if the energy without that of `volumetric_energy`
-        does not depend on the volume.
+        Zero if the energy without that of `volumetric_energy` does not depend on the volume.
         """
-        return 0.0
+        return torch.zeros((), dtype=torch.float64)
 
     def _dilatation(self, j: Tensor) -> tuple[Tensor, Tensor]:
         """Return stretch (...,) and H (..., 3, 3) [-] of a change of volume alone."""
         growth = torch.expm1(torch.log1p(j) / 3) if self.finite else j / 3
         H = growth[..., None, None] * torch.eye(3, dtype=j.dtype, device=j.device)
         return (1 + growth if self.finite else torch.ones_like(j)), H
+
+    @property
+    def compiled_form(self) -> CompiledForm | None:
+        """The law as compiled loops take it; None if it has tensor operations only."""
+        return None
 
     @property
     def classes(self) -> tuple[type, ...]:
@@ -142,25 +160,30 @@ class Material(Parametrised):
         return f"{type(self).__name__}({', '.join(words)})"
 
     @property
-    def mu(self) -> float:
-        """Shear modulus at rest over Young's modulus [-]."""
-        return float(self._at_rest[0, 1, 0, 1])
+    def mu(self) -> Tensor:
+        """Shear modulus at rest over Young's modulus [-], of the shape of `Parametrised.value`."""
+        return self._at_rest[..., 0, 1, 0, 1]
 
     @property
-    def lam(self) -> float:
+    def lam(self) -> Tensor:
         """First Lame parameter at rest over Young's modulus [-]."""
-        return float(self._at_rest[0, 0, 1, 1])
+        return self._at_rest[..., 0, 0, 1, 1]
 
     @property
-    def poisson_ratio(self) -> float:
+    def poisson_ratio(self) -> Tensor:
         """Poisson's ratio at rest [-]."""
         return self.lam / (2 * (self.lam + self.mu))
+
+    @property
+    def _at_rest(self) -> Tensor:
+        rest = torch.zeros(3, 3, dtype=torch.float64)
+        return self.tangent(rest.expand(*self.energy(rest).shape, 3, 3))
 
     def rest_stress(self, H: Tensor) -> Tensor:
         """Return the stress of small strains, A(0) : H, (..., 3, 3) [-]."""
         pressure = self.lam * trace(H)
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        return broadcast_modulus(self.mu, 2) * (H + H.mT) + pressure[..., None, None] * eye
+        return with_axes(self.mu, 2) * (H + H.mT) + pressure[..., None, None] * eye
 
     @property
     def rest_moduli(self) -> Tensor:
@@ -168,35 +191,14 @@ class Material(Parametrised):
 
         They are mu and lambda, of a field those of each cell.
         """
-        both = [torch.as_tensor(modulus, dtype=torch.float64) for modulus in (self.mu, self.lam)]
-        rows = [m if m.ndim == 3 else m.reshape(1, -1, 1) for m in both]
-        return torch.cat(torch.broadcast_tensors(*rows), dim=1)[..., 0]
-
-    def linear_law(self, moduli: Tensor) -> "Material":
-        """Return the law of small strains with moduli in the order of `rest_moduli`, (M,)."""
-        from dpl.fem.materials.linear_elastic import LameElastic
-
-        both = moduli.view(2, -1)
-        if both.shape[1] == 1:
-            return LameElastic(*both[:, 0].tolist())
-        return LameElastic(*both[..., None])
+        return vector_of(self.mu, self.lam)
 
     @property
     def largest_poisson_ratio(self) -> float:
         """Largest Poisson's ratio at rest of all cells and parameters [-]."""
         ends = list(product(*self.parameter_ranges.values()))
         laws = [self.with_parameters(torch.tensor([end], dtype=torch.float64)) for end in ends]
-        ratios = [torch.as_tensor(law.poisson_ratio, dtype=torch.float64) for law in laws]
-        return max(float(ratio.max()) for ratio in ratios)
-
-    @property
-    def _at_rest(self) -> Tensor:
-        if self.is_batched:
-            raise ValueError(
-                f"{type(self).__name__}: a law with ranges must define mu and lam, as "
-                "YoungPoissonMaterial does"
-            )
-        return self.tangent(torch.zeros(1, 3, 3, dtype=torch.float64))[0]
+        return max(float(law.poisson_ratio.max()) for law in laws)
 
     def groups(self, count: int) -> "list[tuple[Material, Tensor]]":
         """Return laws of one class and the numbers of the cells of each, of a body of E cells."""
@@ -220,34 +222,40 @@ class YoungPoissonMaterial(Material):
     young: Constant = 1.0
 
     def check_constants(self) -> None:
-        """See `Material.check_constants`."""
-        if not -1.0 < self._number("poisson") < 0.5:
+        """Check Poisson's ratio and Young's modulus."""
+        if not -1.0 < self.poisson < 0.5:
             raise ValueError(
                 f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)"
             )
-        if not 0.0 < self._number("young") < math.inf:
+        if not 0.0 < self.young < math.inf:
             raise ValueError(f"young = {self.young} must be above 0")
 
     def identity(self) -> dict[str, Any]:
-        """See `Material.identity`; a law with the modulus of the scene has no `young`."""
+        """Return class name and parameters; `young` is left out if it is that of the scene."""
         exclude = ["young"] if isinstance(self.young, int | float) and self.young == 1 else []
         return identity_of(self, exclude=exclude)
 
     @property
-    def mu(self) -> float:
+    def mu(self) -> Tensor:
         """Shear modulus over Young's modulus [-]."""
-        return self._number("young") / (2.0 * (1.0 + self._number("poisson")))
+        return self.value("young") / (2.0 * (1.0 + self.value("poisson")))
 
     @property
-    def lam(self) -> float:
+    def lam(self) -> Tensor:
         """First Lame parameter over Young's modulus [-]."""
-        nu = self._number("poisson")
-        return self._number("young") * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+        nu = self.value("poisson")
+        return self.value("young") * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
 
     @property
-    def bulk(self) -> float:
+    def bulk(self) -> Tensor:
         """Bulk modulus over Young's modulus [-]."""
         return self.lam + 2 / 3 * self.mu
+
+
+def vector_of(*moduli: Tensor) -> Tensor:
+    """Return moduli, each of all cells, as one vector (1, M) or (B, M)."""
+    columns = torch.broadcast_tensors(*moduli, torch.zeros(1, 1, 1))[:-1]
+    return torch.cat(columns, dim=1)[..., 0]
 
 
 def check_moduli(name: str, shear: float, bulk: float, constants: Iterable[float]) -> None:

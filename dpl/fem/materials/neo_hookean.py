@@ -7,12 +7,14 @@ import torch
 from torch import Tensor
 
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-from dpl.fem.materials.isochoric import isochoric_invariants, polynomial_derivatives
-from dpl.fem.materials.material import YoungPoissonMaterial
-from dpl.fem.materials.tensors import (
-    trace,
-    volume_change,
+from dpl.fem.materials.isochoric import (
+    PolynomialMaterial,
+    isochoric_invariants,
+    polynomial_derivatives,
 )
+from dpl.fem.materials.material import YoungPoissonMaterial
+from dpl.fem.materials.tensors import trace, volume_change
+from dpl.fem.materials.volumetric import k4_derivatives
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class NeoHookeanLn(YoungPoissonMaterial, InvariantBasedMaterial):
         return self.mu / 2 * (I1_minus_3 - 2 * log_J) + self.lam / 2 * log_J.square()
 
     @property
-    def constants(self) -> tuple[float, ...]:
+    def constants(self) -> tuple[Tensor, ...]:
         """Return lambda and mu."""
         return self.lam, self.mu
 
@@ -37,36 +39,23 @@ class NeoHookeanLn(YoungPoissonMaterial, InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """See `InvariantBasedMaterial.invariant_derivatives`."""
+        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
         rest = c[0] * log_j
         return rest, 0.0, rest - c[1], 0.0, 0.0, 0.0, 0.0, 0.0, c[0]
 
 
 @dataclass(frozen=True)
-class NeoHookeanIsoK2(YoungPoissonMaterial, InvariantBasedMaterial):
+class NeoHookeanIsoK2(YoungPoissonMaterial, PolynomialMaterial):
     """Neo-Hookean solid NHiso-k2: mu/2 (J^(-2/3) I1 - 3) + kappa/2 (J - 1)^2.
 
     Source: Simo, Hughes (1998), section 9.2; the volumetric term is that of Abaqus (D1 = 2/kappa).
     """
 
-    def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
-        i1, _, j = isochoric_invariants(H)
-        return self.mu / 2 * i1 + self.bulk / 2 * j.square()
-
     @property
-    def constants(self) -> tuple[float, ...]:
+    def constants(self) -> tuple[Tensor, ...]:
         """Return mu/2, 0, 0, 0 and kappa."""
-        return self.mu / 2, 0.0, 0.0, 0.0, self.bulk
-
-    @staticmethod
-    def invariant_derivatives(
-        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
-    ) -> tuple[Any, ...]:
-        """See `InvariantBasedMaterial.invariant_derivatives`."""
-        return polynomial_derivatives(
-            c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j)
-        )
+        half = self.mu / 2
+        return half, 0 * half, 0 * half, 0 * half, self.bulk
 
 
 @dataclass(frozen=True)
@@ -85,10 +74,8 @@ class NeoHookeanIsoK4(NeoHookeanIsoK2):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """See `InvariantBasedMaterial.invariant_derivatives`."""
-        return polynomial_derivatives(
-            c, i1, i2, m1, c[4] / 2 * j * (2 + j), c[4] * (1 + j) * (1 + j)
-        )
+        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
+        return polynomial_derivatives(c, i1, i2, m1, k4_derivatives(c[4], j))
 
 
 @dataclass(frozen=True)
@@ -110,7 +97,7 @@ class StableNeoHookean(YoungPoissonMaterial, InvariantBasedMaterial):
         return m / 2 * (i1 - torch.log(4 + i1)) + stiffness / 2 * volume
 
     @property
-    def constants(self) -> tuple[float, ...]:
+    def constants(self) -> tuple[Tensor, ...]:
         """Return m and l."""
         return 4 / 3 * self.mu, self.lam + 5 / 6 * self.mu
 
@@ -118,7 +105,7 @@ class StableNeoHookean(YoungPoissonMaterial, InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """See `InvariantBasedMaterial.invariant_derivatives`."""
+        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
         near = 1 / (4 + i1)
         J = 1 + j
         volume = c[1] * j * J - 3 / 4 * c[0] * j

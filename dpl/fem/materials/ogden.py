@@ -32,7 +32,7 @@ class OgdenK2(Material):
     bulk: float
 
     def check_constants(self) -> None:
-        """See `Material.check_constants`: as many exponents as moduli, none 0, and resistance."""
+        """Check that there are as many exponents as moduli, none 0, and that the body resists."""
         if len(self.shear) != len(self.exponents) or not all(self.exponents):
             raise ValueError(
                 f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"

@@ -1,38 +1,134 @@
 """Constants of laws: numbers, ranges, or fields with a value for each cell."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
+import numpy as np
 import skfem
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.materials.cell_field import CellField
+from dpl.fem.mesh.reading import read_cell_data
 from dpl.fem.mesh.regions import Origin
 from dpl.fem.ranges import ParameterRange, is_range
 from dpl.system.checks import named_errors
 
+
+@dataclass(frozen=True, eq=False)
+class CellField:
+    """Constant of a law with a value in each cell.
+
+    Attributes:
+        values: Function of the centres of the cells (E, D) [m] that returns the values (E,), the
+            values in the order of the cells of the mesh, or the name of such cell data in `file`.
+        file: File with this cell data; its cells are those of the mesh.
+
+    Raises:
+        ValueError: There is a name without a file, or a file without a name.
+    """
+
+    values: Callable[[NDArray[np.float64]], NDArray[np.float64]] | Sequence[float] | str
+    file: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.values, str) != (self.file is not None):
+            raise ValueError(
+                "values must be the name of cell data if there is a file, and a function or an "
+                "array if not"
+            )
+
+    def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
+        """Return the values, (E, 1); arguments as in `Material.on`.
+
+        Raises:
+            ValueError: There is not one finite number for each cell.
+        """
+        mesh = basis.mesh
+        centres = (mesh.p[:, mesh.t].mean(axis=1).T + origin) * length
+        given: Any = self.values
+        if self.file is not None:
+            (given,) = read_cell_data(self.file, [str(self.values)])
+        elif callable(given):
+            given = given(centres)
+        values = np.asarray(given, dtype=np.float64)
+        if values.shape != (len(centres),) or not np.isfinite(values).all():
+            raise ValueError(
+                f"values of shape {values.shape} must be {len(centres)} finite numbers, one for "
+                "each cell"
+            )
+        return torch.from_numpy(values.copy())[:, None]
+
+
 if TYPE_CHECKING:
-    Constant = Any  # a batch of values goes through the same arithmetic
+    Constant = Any  # a tensor after `on` and `with_parameters`
 else:
     # number, range or field
     Constant = float | Sequence[float] | Mapping[str, float | str] | CellField
 
 
 class Parametrised:
-    """Dataclass whose constants are numbers, ranges or fields.
+    """Dataclass whose constants are given as numbers, ranges or fields.
 
     A constant with a range, [low, high] or {low, high, distribution}, has a value for each load.
-    Constants are then numbers, fields with a value for each cell (E, 1), or, in a batch, values for
-    each member (B, 1, 1). They multiply quantities of the points, (B, E, Q).
+    `value` returns a constant as a tensor that broadcasts against the points (B, E, Q): of shape
+    (), of a field (E, 1), and of a batch of which each member has its own (B, 1, 1).
 
     Attributes:
         ranged: Names of the constants that may be ranges [low, high] or fields.
     """
 
     ranged: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for name in self.ranged:
+            value = getattr(self, name)
+            if is_range(value):
+                object.__setattr__(self, name, ParameterRange.of(name, value))
+            elif isinstance(value, Tensor) and not value.ndim:  # a modulus of another law
+                object.__setattr__(self, name, value.item())
+        values = {name: getattr(self, name) for name in self.ranged}
+        unknown = any(isinstance(value, CellField) for value in values.values())
+        if unknown or torch.compiler.is_compiling():  # a traced graph has no values to check
+            return
+        tensors, ranges = self._tensors, self.parameter_ranges
+        if not tensors and not ranges:
+            self.check_constants()
+            return
+        for corner, extreme in product(product(*ranges.values()), (torch.amin, torch.amax)):
+            numbers = {name: float(extreme(value.detach())) for name, value in tensors.items()}
+            replace(cast("Any", self), **dict(zip(ranges, corner, strict=True)), **numbers)
+
+    def check_constants(self) -> None:
+        """Check the constants, which are numbers here: those given, or the ends of ranges.
+
+        Raises:
+            ValueError: The law does not allow a value.
+        """
+
+    def value(self, name: str) -> Tensor:
+        """Return a constant in float64, see the class.
+
+        Raises:
+            ValueError: It is a range.
+        """
+        value = getattr(self, name)
+        if isinstance(value, ParameterRange):
+            raise ValueError(
+                f"{name} = {list(value)} is a range; choose a value with "
+                "Problem.with_parameters, or give Load.parameters for each load"
+            )
+        if isinstance(value, Tensor):
+            return value
+        return torch.full((), value, dtype=torch.float64)
+
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """Numbers and tensors that the functions of the law in compiled loops take."""
+        return tuple(map(self.value, self.ranged))
 
     @property
     def parameter_ranges(self) -> dict[str, ParameterRange]:
@@ -44,16 +140,15 @@ class Parametrised:
         return {name: v for name, v in values.items() if isinstance(v, ParameterRange)}
 
     @property
-    def is_batched(self) -> bool:
-        """True if each member of a batch has constants of its own, see `with_parameters`."""
-        values = (getattr(self, name) for name in self.ranged)
-        return any(isinstance(value, Tensor) and value.ndim == 3 for value in values)
+    def rest_moduli(self) -> Tensor:
+        """Moduli at rest of all cells, a vector (1, M) or (B, M) [-], see `linear_law`."""
+        raise NotImplementedError
 
     @property
-    def fields(self) -> dict[str, Tensor]:
-        """Constants that are fields, (E, 1), by name."""
+    def _tensors(self) -> dict[str, Tensor]:
+        """Constants that are fields or those of a batch."""
         values = {name: getattr(self, name) for name in self.ranged}
-        return {n: v for n, v in values.items() if isinstance(v, Tensor) and v.ndim == 2}
+        return {name: v for name, v in values.items() if isinstance(v, Tensor)}
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
         """Return the law with the values of its fields in the cells of a body.
@@ -68,14 +163,15 @@ class Parametrised:
         """
         made = {}
         for name in self.ranged:
-            if hasattr(value := getattr(self, name), "on"):
+            if isinstance(value := getattr(self, name), CellField):
                 with named_errors(f"{name}: "):
                     made[name] = value.on(basis, length, origin)
         return replace(cast("Any", self), **made) if made else self
 
     def of_cells(self, cells: Tensor) -> Self:
         """Return the law of some cells (C,) of the body."""
-        chosen = {name: values[cells] for name, values in self.fields.items()}
+        fields = {name: v for name, v in self._tensors.items() if v.shape[-2] > 1}
+        chosen = {name: v[..., cells, :] for name, v in fields.items()}
         return replace(cast("Any", self), **chosen) if chosen else self
 
     def centred(self) -> Self:
@@ -101,66 +197,18 @@ class Parametrised:
             raise ValueError(f"parameters: {type(self).__name__} has ranges of {list(names)}")
         if not names:
             return self
-        law: Any = self  # a dataclass if it has ranges
-        if not torch.compiler.is_compiling():  # a traced graph has no values to check
-            values = parameters.detach()
-            if len(parameters) == 1 and not parameters.requires_grad:
-                return replace(law, **dict(zip(names, values[0].tolist(), strict=True)))
-            for extreme in (values.amin(0), values.amax(0)):
-                self.with_parameters(extreme[None])
-        # beside cells and points, so that numbers of a point, (B, E, Q), take their own
-        columns = parameters.T[..., None, None]
-        return replace(law, **dict(zip(names, columns, strict=True)))
-
-    def __post_init__(self) -> None:
-        """Check the constants of a dataclass, and both ends of its ranges.
-
-        Raises:
-            ValueError: The law does not allow a value, or a range is none.
-        """
-        for name in self.ranged:
-            if is_range(value := getattr(self, name)):
-                object.__setattr__(self, name, ParameterRange.of(name, value))
-        unknown = any(hasattr(getattr(self, name), "on") for name in self.ranged)
-        if self.is_batched or unknown:
-            return
-        if fields := self.fields:
-            for extreme in (torch.amin, torch.amax):
-                replace(cast("Any", self), **{n: float(extreme(v)) for n, v in fields.items()})
-            return
-        if not (ranges := self.parameter_ranges):
-            self.check_constants()
-            return
-        for corner in product(*ranges.values()):
-            self.with_parameters(torch.tensor([corner], dtype=torch.float64))
-
-    def _number(self, name: str) -> Any:
-        """Return a constant; a field or a batch of values goes through the same arithmetic.
-
-        Raises:
-            ValueError: It is a range.
-        """
-        value = getattr(self, name)
-        if isinstance(value, ParameterRange):
-            raise ValueError(
-                f"{name} = {list(value)} is a range; choose a value with "
-                "Problem.with_parameters, or give Load.parameters for each load"
-            )
-        return value
-
-    def check_constants(self) -> None:
-        """Check the values of the constants.
-
-        Raises:
-            ValueError: The law does not allow a value.
-        """
+        values: Any = parameters.T[..., None, None]  # beside cells and points
+        compiling = torch.compiler.is_compiling()
+        if len(parameters) == 1 and not parameters.requires_grad and not compiling:
+            values = parameters[0].tolist()
+        return replace(cast("Any", self), **dict(zip(names, values, strict=True)))
 
 
 class Composed(Parametrised):
     """Law of several parts, whose parameters have the name of the part before their own."""
 
     @property
-    def parts(self) -> Mapping[str, Parametrised]:
+    def parts(self) -> Mapping[str, Any]:
         """The parts, by name."""
         raise NotImplementedError
 
@@ -170,25 +218,19 @@ class Composed(Parametrised):
 
     @property
     def parameter_ranges(self) -> dict[str, ParameterRange]:
-        """See `Parametrised.parameter_ranges`."""
-        return self._by_part(lambda part: part.parameter_ranges)
+        """Ranges of the parts, by name, see `Parametrised.parameter_ranges`."""
+        pairs = [(key, part.parameter_ranges.items()) for key, part in self.parts.items()]
+        return {f"{key}.{name}": ends for key, ranges in pairs for name, ends in ranges}
 
     @property
-    def fields(self) -> dict[str, Tensor]:
-        """See `Parametrised.fields`."""
-        return self._by_part(lambda part: part.fields)
-
-    def _by_part(self, names: Callable[[Parametrised], Mapping[str, Any]]) -> dict[str, Any]:
-        parts = self.parts.items()
-        return {f"{key}.{name}": one for key, part in parts for name, one in names(part).items()}
-
-    @property
-    def is_batched(self) -> bool:
-        """See `Parametrised.is_batched`."""
-        return any(part.is_batched for part in self.parts.values())
+    def rest_moduli(self) -> Tensor:
+        """Moduli at rest of the parts, one after the other, (1, M) or (B, M) [-]."""
+        parts = [part.rest_moduli for part in self.parts.values()]
+        batch = torch.broadcast_shapes(*(part.shape[:1] for part in parts))
+        return torch.cat([part.expand(*batch, -1) for part in parts], dim=1)
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
-        """See `Parametrised.on`."""
+        """Return the law of a body, see `Parametrised.on`."""
         parts = {}
         for key, part in self.parts.items():
             with named_errors(f"{key}."):
@@ -196,11 +238,11 @@ class Composed(Parametrised):
         return self._changed(parts)
 
     def of_cells(self, cells: Tensor) -> Self:
-        """See `Parametrised.of_cells`."""
+        """Return the law of some cells (C,) of the body."""
         return self._changed({key: part.of_cells(cells) for key, part in self.parts.items()})
 
     def centred(self) -> Self:
-        """See `Parametrised.centred`."""
+        """Return the law for one point of each cell, see `Parametrised.centred`."""
         return self._changed({key: part.centred() for key, part in self.parts.items()})
 
     def _changed(self, parts: Mapping[str, Parametrised]) -> Self:
@@ -208,7 +250,7 @@ class Composed(Parametrised):
         return self if same else self.with_parts(parts)
 
     def with_parameters(self, parameters: Tensor) -> Self:
-        """See `Parametrised.with_parameters`."""
+        """Return the law with values (B, P) in place of the ranges of its parts."""
         counts = [len(part.parameter_ranges) for part in self.parts.values()]
         if parameters.shape[-1] != sum(counts):
             names = list(self.parameter_ranges)

@@ -61,9 +61,10 @@ def symmetric_product(A: Tensor) -> Tensor:
     return (product + product.transpose(-1, -2)) / 2
 
 
-def broadcast_modulus(modulus: Any, axes: int) -> Any:
-    """Return a modulus with `axes` trailing axes of length 1; a number stays a number.
+def with_axes(values: Any, axes: int) -> Any:
+    """Return values of points with `axes` trailing axes of length 1, as factors of tensors.
 
-    Moduli of a batch are (B, 1, 1); with two more axes they multiply tensors (B, E, Q, 3, 3).
+    A number or a tensor of shape () is returned as it is: it does not change the type of tensors.
     """
-    return modulus[(..., *[None] * axes)] if isinstance(modulus, Tensor) else modulus
+    has_axes = isinstance(values, Tensor) and values.ndim > 0
+    return values[(..., *[None] * axes)] if has_axes else values

@@ -1,4 +1,4 @@
-"""Energies of the volume alone, as matrix of laws of fibres that resist shear as well."""
+"""Energies of the volume alone: terms of other laws, and matrix of laws of fibres."""
 
 import math
 from dataclasses import dataclass
@@ -10,6 +10,16 @@ from torch import Tensor
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.parameters import Constant
 from dpl.fem.materials.tensors import volume_change
+
+
+def k2_derivatives(bulk: Any, j: Any) -> tuple[Any, Any]:
+    """Return J U' and J (J U')' of U = bulk/2 (J - 1)^2 at J = 1 + j."""
+    return bulk * j * (1 + j), bulk * (1 + j) * (1 + 2 * j)
+
+
+def k4_derivatives(bulk: Any, j: Any) -> tuple[Any, Any]:
+    """Return J U' and J (J U')' of U = bulk/4 (J^2 - 1 - 2 ln J) at J = 1 + j."""
+    return bulk / 2 * j * (2 + j), bulk * (1 + j) * (1 + j)
 
 
 @dataclass(frozen=True)
@@ -30,36 +40,31 @@ class VolumetricK2(InvariantBasedMaterial):
     bulk: Constant
 
     def check_constants(self) -> None:
-        """See `Material.check_constants`."""
+        """Check that the body resists compression."""
         if not 0 < self.bulk < math.inf:
             raise ValueError(f"bulk = {self.bulk} must be above 0")
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
-        return self._number("bulk") / 2 * volume_change(H).square()
+        return self.value("bulk") / 2 * volume_change(H).square()
 
     @property
-    def constants(self) -> tuple[float, ...]:
-        """Return bulk."""
-        return (self._number("bulk"),)
-
-    @property
-    def mu(self) -> float:
+    def mu(self) -> Tensor:
         """Shear modulus at rest [-]: zero."""
-        return 0.0
+        return torch.zeros((), dtype=torch.float64)
 
     @property
-    def lam(self) -> float:
+    def lam(self) -> Tensor:
         """First Lame parameter at rest over Young's modulus [-]."""
-        return self._number("bulk")
+        return self.value("bulk")
 
     @staticmethod
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """See `InvariantBasedMaterial.invariant_derivatives`."""
-        p = c[0] * j * (1 + j)
-        return p, 0.0, p, 0.0, 0.0, 0.0, 0.0, 0.0, c[0] * (1 + j) * (1 + 2 * j)
+        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
+        p, pJ = k2_derivatives(c[0], j)
+        return p, 0.0, p, 0.0, 0.0, 0.0, 0.0, 0.0, pJ
 
 
 @dataclass(frozen=True)
@@ -72,12 +77,12 @@ class VolumetricK4(VolumetricK2):
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
         j = volume_change(H)
-        return self._number("bulk") / 4 * (j * (2 + j) - 2 * torch.log1p(j))
+        return self.value("bulk") / 4 * (j * (2 + j) - 2 * torch.log1p(j))
 
     @staticmethod
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """See `InvariantBasedMaterial.invariant_derivatives`."""
-        p = c[0] / 2 * j * (2 + j)
-        return p, 0.0, p, 0.0, 0.0, 0.0, 0.0, 0.0, c[0] * (1 + j) * (1 + j)
+        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
+        p, pJ = k4_derivatives(c[0], j)
+        return p, 0.0, p, 0.0, 0.0, 0.0, 0.0, 0.0, pJ

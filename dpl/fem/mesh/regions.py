@@ -1,8 +1,7 @@
 """Regions of a body, which select nodes and facets for boundary conditions and loads.
 
 A region is a function that maps points (N, D) [m] to a mask (N,), or a `Tag`, the name of a part of
-the mesh. `nodes_in`, `facets_in` and `cells_in`
-take both.
+the mesh. `nodes_in`, `facets_in` and `cells_in` take both.
 """
 
 import math
@@ -23,16 +22,12 @@ class Plane:
     Attributes:
         axis: 0, 1 or 2 for x, y or z.
         at: Coordinate of the plane [m], or "min" or "max" for the extreme nodes of the body.
-
-    Raises:
-        ValueError: `axis` or `at` is invalid.
     """
 
     axis: int
     at: float | str
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         _check_axis(self.axis)
         if isinstance(self.at, str) and self.at not in ("min", "max"):
             raise ValueError(f"at = {self.at!r} must be min, max or a coordinate [m]")
@@ -52,16 +47,12 @@ class Box:
 
     Attributes:
         lower, upper: Opposite corners, D coordinates each [m].
-
-    Raises:
-        ValueError: A coordinate of `lower` is above that of `upper`.
     """
 
     lower: Sequence[float]
     upper: Sequence[float]
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         lower, upper = list(self.lower), list(self.upper)
         if len(lower) != len(upper) or not (np.array(lower) <= upper).all():
             raise ValueError(f"lower = {lower} must not be above upper = {upper}")
@@ -81,16 +72,12 @@ class Sphere:
     Attributes:
         centre: D coordinates [m].
         radius: Radius [m].
-
-    Raises:
-        ValueError: The centre is not finite, or the radius not positive.
     """
 
     centre: Sequence[float]
     radius: float
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         _check_ball(self.centre, self.radius)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -108,9 +95,6 @@ class Cylinder:
         axis: 0, 1 or 2 for x, y or z.
         radius: Radius [m].
         centre: A point of the axis, D coordinates [m]; default: the origin.
-
-    Raises:
-        ValueError: `axis` is invalid, the centre not finite or the radius not positive.
     """
 
     axis: int
@@ -118,7 +102,6 @@ class Cylinder:
     centre: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         _check_axis(self.axis)
         _check_ball(() if self.centre is None else self.centre, self.radius)
 
@@ -136,15 +119,11 @@ class Tag:
     Attributes:
         name: A key of scikit-fem's `mesh.boundaries` (facets) or `mesh.subdomains` (cells). Facets
             take precedence.
-
-    Raises:
-        ValueError: The name is not a string, or empty.
     """
 
     name: str
 
     def __post_init__(self) -> None:
-        """Check the attribute."""
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f'name = {self.name!r} must be a string; write numbers in quotes, "7"')
 

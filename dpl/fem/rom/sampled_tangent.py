@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly import reduced_loops
-from dpl.fem.assembly.kernels import call_compiled, constants_of
-from dpl.fem.assembly.numba_laws import CompiledLaw, Law, required_terms
+from dpl.fem.assembly.kernels import call_compiled, constants_of, form_of
+from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.materials.material import Material
@@ -87,13 +87,13 @@ class SampledTangent:
     def _moduli_change_product(self, problem: Problem, displacement: Tensor) -> Single:
         """Return w vol (A(H) - A(0)) G, (C, D D, R)."""
         law = one_law(problem.material.of_cells(self._cells).centred())
-        if not isinstance(law, CompiledLaw):
+        if (form := law.compiled_form) is None:
             return self._reference_product(law, displacement)
         out = np.empty_like(self._basis)
         u = displacement.contiguous().numpy()
         call_compiled(
             reduced_loops.moduli_change_product,
-            *(Law.of(law, reduced_loops.SOURCES), constants_of(law)[0]),
+            *(Law.of(form, reduced_loops.SOURCES), constants_of(law)[0]),
             *(self._required_terms, float(law.finite)),
             *(u, self._nodes, self._dN, self._dV, self._basis, out),
         )
@@ -113,9 +113,7 @@ class SampledTangent:
 
     @cached_property
     def _required_terms(self) -> int:
-        law = one_law(self.problem.reference.material)
-        assert isinstance(law, CompiledLaw)
-        return required_terms(law)
+        return required_terms(form_of(one_law(self.problem.reference.material)))
 
     def _at_rest(self, law: Material) -> Array:
         """Return W^T K(0) W, (R, R), of a law of the body."""

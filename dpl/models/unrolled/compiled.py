@@ -49,8 +49,8 @@ def law_arguments(law: InvariantBasedMaterial) -> LawArguments:
     rows = [constants_of(law)[0], *(np.reshape(one, (-1, 1)) for one in (law.mu, law.lam))]
     count = max(map(len, rows))
     constants = np.concatenate([np.broadcast_to(row, (count, row.shape[1])) for row in rows], 1)
-    terms = required_terms(law), float(law.finite)
-    return LawArguments(Law.of(law, SOURCES), constants, *terms)
+    terms = required_terms(law.compiled_form), float(law.finite)
+    return LawArguments(Law.of(law.compiled_form, SOURCES), constants, *terms)
 
 
 @dataclass(frozen=True)

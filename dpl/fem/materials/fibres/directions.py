@@ -19,7 +19,7 @@ from scipy.sparse.linalg import cg
 from skfem.models.poisson import laplace
 from torch import Tensor
 
-from dpl.fem.materials.fibre_reinforced import FibreDirections
+from dpl.fem.materials.fibres.reinforced import FibreDirections
 from dpl.fem.mesh.reading import read_cell_data
 from dpl.fem.mesh.regions import Origin, Region, facets_in
 from dpl.fem.mesh.validation import listed
@@ -46,7 +46,6 @@ class ConstantFibres(FibreDirections):
     sheet: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         self.constant()
 
     def constant(self) -> Tensor:
@@ -99,7 +98,6 @@ class FibreData(FibreDirections):
     file: str | Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         for name, value in (("fibre", self.fibre), ("sheet", self.sheet)):
             if value is not None and isinstance(value, str) != (self.file is not None):
                 raise ValueError(
@@ -147,7 +145,6 @@ class LaplaceFibres(FibreDirections):
     outer_angle: float
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         _unit_vectors("longitudinal", np.array([self.longitudinal]))
         for name in ("inner_angle", "outer_angle"):
             if not math.isfinite(value := getattr(self, name)):

@@ -6,7 +6,6 @@ order.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -14,6 +13,8 @@ import torch
 from torch import Tensor
 
 from dpl.fem.materials.arithmetic import exp, positive_part, step
+from dpl.fem.materials.linear_elastic import linear_law
+from dpl.fem.materials.material import vector_of
 from dpl.fem.materials.parameters import Constant, Parametrised
 
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))  # rows and columns, in their order
@@ -36,12 +37,15 @@ class FibreEnergy(Parametrised):
         raise NotImplementedError
 
     @property
-    def constants(self) -> tuple[Any, ...]:
-        """Constants that `strain_derivatives` takes.
+    def rest_moduli(self) -> Tensor:
+        """The 21 moduli at rest of all cells, a vector (1, 21 M) or (B, 21 M) [-]."""
+        return vector_of(*self.moduli_at_rest)
 
-        Each is a number, or a tensor that broadcasts against the points (B, E, Q).
-        """
-        raise NotImplementedError
+    @property
+    def moduli_at_rest(self) -> tuple[Tensor, ...]:
+        """The 21 moduli of `strain_derivatives` at rest [-]."""
+        rest = (torch.zeros((), dtype=torch.float64),) * 6
+        return as_tensors(self.strain_derivatives(self.constants, rest)[1], rest)
 
     @staticmethod
     def strain_derivatives(c: Any, e: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -82,7 +86,6 @@ class Guccione(FibreEnergy):
     bfs: Constant
 
     def check_constants(self) -> None:
-        """See `FibreEnergy.check_constants`."""
         for name, value in vars(self).items():
             check_constant(name, value)
 
@@ -91,16 +94,11 @@ class Guccione(FibreEnergy):
         e11, e22, e33, e12, e23, e13 = components(e)
         along, across = e11.square(), e22.square() + e33.square() + 2 * e23.square()
         shear = 2 * (e12.square() + e13.square())
-        return self.c / 2 * torch.expm1((self.bf * along + self.bt * across + self.bfs * shear) / 4)
-
-    @property
-    def constants(self) -> tuple[float, ...]:
-        """Return c, bf, bt and bfs."""
-        return self.c, self.bf, self.bt, self.bfs
+        c, bf, bt, bfs = self.constants
+        return c / 2 * torch.expm1((bf * along + bt * across + bfs * shear) / 4)
 
     @staticmethod
     def strain_derivatives(c: Any, e: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """See `FibreEnergy.strain_derivatives`."""
         # dQ/dE
         q11, q22, q33 = c[1] * e[0], c[2] * e[1], c[2] * e[2]
         q12, q23, q13 = c[3] * e[3], c[2] * e[4], c[3] * e[5]
@@ -143,7 +141,6 @@ class HolzapfelGasserOgdenFibres(FibreEnergy):
     families: int = 2
 
     def check_constants(self) -> None:
-        """See `FibreEnergy.check_constants`."""
         check_constant("k1", self.k1)
         check_constant("k2", self.k2)
         if not 0 <= self.kappa <= 1 / 3:
@@ -162,21 +159,21 @@ class HolzapfelGasserOgdenFibres(FibreEnergy):
         return sum((_exponential_energy(k1, k2, positive_part(x)) for x in families), 0 * e11)
 
     @property
-    def constants(self) -> tuple[float, ...]:
+    def constants(self) -> tuple[Tensor, ...]:
         """Return k1, k2 and the tensors M_i = dE_i/de: M11, M22, M33 and M12 of each family.
 
         A single family is two equal families with half of k1.
         """
-        cos, sin, axial = math.cos(self.angle), math.sin(self.angle), 1 - 3 * self.kappa
-        normal = self.kappa + axial * cos**2, self.kappa + axial * sin**2, self.kappa
+        k1, k2, kappa = super().constants
+        cos, sin, axial = math.cos(self.angle), math.sin(self.angle), 1 - 3 * kappa
+        normal = kappa + axial * cos**2, kappa + axial * sin**2, kappa
         shear = axial * cos * sin
         if self.families == 1:
-            return self.k1 / 2, self.k2, *normal, shear, shear
-        return self.k1, self.k2, *normal, shear, -shear
+            return k1 / 2, k2, *normal, shear, shear
+        return k1, k2, *normal, shear, -shear
 
     @staticmethod
     def strain_derivatives(c: Any, e: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """See `FibreEnergy.strain_derivatives`."""
         normal = c[2] * e[0] + c[3] * e[1] + c[4] * e[2]
         m1, m2 = tension_derivatives(c[0], c[1], normal + 2 * c[5] * e[3])
         n1, n2 = tension_derivatives(c[0], c[1], normal + 2 * c[6] * e[3])
@@ -216,7 +213,6 @@ class HolzapfelOgdenFibres(FibreEnergy):
     bfs: Constant
 
     def check_constants(self) -> None:
-        """See `FibreEnergy.check_constants`."""
         for name in ("af", "bf", "bs", "bfs"):
             check_constant(name, getattr(self, name))
         for name in ("as_", "afs"):
@@ -225,18 +221,13 @@ class HolzapfelOgdenFibres(FibreEnergy):
     def energy(self, e: Tensor) -> Tensor:
         """Return the energy density, see `FibreEnergy.energy`."""
         e11, e22, _, e12, _, _ = components(e)
-        fibres = _exponential_energy(self.af, self.bf, positive_part(e11))
-        sheets = _exponential_energy(self.as_, self.bs, positive_part(e22))
-        return fibres + sheets + _exponential_energy(self.afs, self.bfs, e12)
-
-    @property
-    def constants(self) -> tuple[float, ...]:
-        """Return af, bf, as_, bs, afs and bfs."""
-        return self.af, self.bf, self.as_, self.bs, self.afs, self.bfs
+        af, bf, as_, bs, afs, bfs = self.constants
+        fibres = _exponential_energy(af, bf, positive_part(e11))
+        sheets = _exponential_energy(as_, bs, positive_part(e22))
+        return fibres + sheets + _exponential_energy(afs, bfs, e12)
 
     @staticmethod
     def strain_derivatives(c: Any, e: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """See `FibreEnergy.strain_derivatives`."""
         f1, f2 = tension_derivatives(c[0], c[1], e[0])
         s1, s2 = tension_derivatives(c[2], c[3], e[1])
         g1, g2 = exponential_derivatives(c[4], c[5], e[3])
@@ -251,25 +242,26 @@ class LinearFibres(FibreEnergy):
     """Quadratic energy E : D : E / 2, the limit of the others at small strains.
 
     Attributes:
-        moduli: The 21 moduli of `strain_derivatives` over E [-].
+        moduli: The 21 moduli of `strain_derivatives` over E, (21, E or 1, 1) [-].
     """
 
-    moduli: Sequence[float]
+    ranged: ClassVar[tuple[str, ...]] = ("moduli",)
+
+    moduli: Tensor
 
     def energy(self, e: Tensor) -> Tensor:
         """Return the energy density, see `FibreEnergy.energy`."""
-        S = self.strain_derivatives(self.moduli, components(e))[0]
+        S = self.strain_derivatives(self.constants, components(e))[0]
         twice = [1, 1, 1, 2, 2, 2]
         return sum(k / 4 * s * x for k, s, x in zip(twice, S, components(e), strict=True))
 
     @property
-    def constants(self) -> tuple[float, ...]:
+    def constants(self) -> tuple[Tensor, ...]:
         """Return the moduli."""
         return tuple(self.moduli)
 
     @staticmethod
     def strain_derivatives(c: Any, e: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """See `FibreEnergy.strain_derivatives`."""
         E11, E22, E33, E12, E23, E13 = e[0] / 2, e[1] / 2, e[2] / 2, e[3], e[4], e[5]
         S = (
             c[0] * E11 + c[1] * E22 + c[2] * E33 + c[3] * E12 + c[4] * E23 + c[5] * E13,
@@ -280,6 +272,17 @@ class LinearFibres(FibreEnergy):
             c[5] * E11 + c[10] * E22 + c[14] * E33 + c[17] * E12 + c[19] * E23 + c[20] * E13,
         )
         return S, c
+
+
+@linear_law.register
+def _of_fibres(law: FibreEnergy, moduli: Tensor) -> LinearFibres:
+    return LinearFibres(moduli.view(21, -1, 1))
+
+
+def as_tensors(entries: tuple[Any, ...], e: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Return numbers and tensors as tensors of one shape; type and device are those of e."""
+    full = [torch.as_tensor(entry).to(e[0]) for entry in (e[0], *entries)]
+    return torch.broadcast_tensors(*full)[1:]
 
 
 def components(e: Tensor) -> tuple[Tensor, ...]:
@@ -302,17 +305,13 @@ def tension_derivatives(a: Any, b: Any, x: Any) -> tuple[Any, Any]:
     return f * y, f * (step(x) + 2 * square)
 
 
-def _exponential_energy(a: float, b: float, x: Tensor) -> Tensor:
+def _exponential_energy(a: Tensor, b: Tensor, x: Tensor) -> Tensor:
     """Return a/(2 b) (exp(b x^2) - 1)."""
     return a / (2 * b) * torch.expm1(b * x.square())
 
 
 def check_constant(name: str, value: float, *, zero: bool = False) -> None:
-    """Check that a constant of fibres is above 0, or from 0.
-
-    Raises:
-        ValueError: It is not, or it is no finite number.
-    """
+    """Raise a ValueError unless a constant of fibres is finite and above 0, or with `zero` 0."""
     allowed = 0 <= value < math.inf if zero else 0 < value < math.inf
     if not allowed:
         raise ValueError(f"{name} = {value} must be {'at least' if zero else 'above'} 0")

@@ -8,15 +8,14 @@ import skfem
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.fibre_energies import FibreEnergy, LinearFibres, components
+from dpl.fem.materials.fibres.energies import FibreEnergy, LinearFibres, as_tensors, components
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-from dpl.fem.materials.material import Material, Response
+from dpl.fem.materials.material import CompiledForm, Material, Response
 from dpl.fem.materials.parameters import Composed
 from dpl.fem.materials.tensors import green_lagrange
 from dpl.fem.mesh.regions import Origin
 from dpl.system.checks import named_errors
 
-_REST = (torch.zeros(1, 1, dtype=torch.float64),) * 6  # components of no strain
 ORTHONORMAL = 1e-6  # largest entry of Q^T Q - I
 COMPONENT = ((0, 3, 5), (3, 1, 4), (5, 4, 2))  # number of each component ij
 
@@ -71,7 +70,6 @@ class FibreReinforced(Composed, Material):
     directions: FibreDirections | Tensor
 
     def __post_init__(self) -> None:
-        """Check matrix and frames."""
         is_linear = isinstance(self.fibres, LinearFibres)  # a term of K(0), which is used at rest
         if not (
             isinstance(self.matrix, InvariantBasedMaterial) and (self.matrix.finite or is_linear)
@@ -91,21 +89,18 @@ class FibreReinforced(Composed, Material):
 
     @property
     def finite(self) -> bool:  # type: ignore[override]
-        """See `Material.finite`; False for a term of K(0) only."""
+        """False for a term of K(0) only."""
         return self.matrix.finite
 
     @property
     def classes(self) -> tuple[type, ...]:
-        """See `Material.classes`."""
         return type(self), type(self.matrix), type(self.fibres)
 
     @property
     def parts(self) -> Mapping[str, Any]:
-        """See `Composed.parts`."""
         return {"matrix": self.matrix, "fibres": self.fibres}
 
     def with_parts(self, parts: Mapping[str, Any]) -> Self:
-        """See `Composed.with_parts`."""
         return replace(self, **parts)
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
@@ -144,6 +139,11 @@ class FibreReinforced(Composed, Material):
         return replace(super().centred(), directions=U @ V)
 
     @property
+    def compiled_form(self) -> CompiledForm:
+        """Matrix, fibres and their frames."""
+        return CompiledForm(self.matrix, self.fibres, self.frames_of_points)
+
+    @property
     def constants(self) -> tuple[Any, ...]:
         """Constants of matrix and fibres."""
         return *self.matrix.constants, *self.fibres.constants
@@ -170,16 +170,14 @@ class FibreReinforced(Composed, Material):
         return self.matrix.energy(H) + self.fibres.energy(Q.mT @ (2 * green_lagrange(H)) @ Q)
 
     def volumetric_energy(self, j: Tensor) -> Tensor:
-        """See `Material.volumetric_energy`."""
         return self.matrix.volumetric_energy(j)
 
     def pressure(self, j: Tensor) -> Tensor:
-        """See `Material.pressure`."""
         return self.matrix.pressure(j)
 
     @property
     def point_bulk(self) -> Tensor:
-        """See `Material.point_bulk`; twice the shear modulus at rest.
+        """Bulk modulus that stays at the points: twice the shear modulus at rest [-].
 
         The energy of the fibres depends on the volume too. Without this modulus, fibres under
         tension can invert points of a cell without a change of its projected volume.
@@ -195,7 +193,8 @@ class FibreReinforced(Composed, Material):
         """Return the first Piola-Kirchhoff stress, see `Material.stress`."""
         Q = self._rotation(H)
         e = components(Q.mT @ (2 * green_lagrange(H)) @ Q)
-        S = Q @ _tensor(self.fibres.strain_derivatives(self.fibres.constants, e)[0], e) @ Q.mT
+        local, _ = self.fibres.strain_derivatives(self.fibres.constants, e)
+        S = Q @ _tensor(as_tensors(local, e)) @ Q.mT
         return self.matrix.stress(H) + S + H @ S
 
     def tangent(self, H: Tensor) -> Tensor:
@@ -203,16 +202,13 @@ class FibreReinforced(Composed, Material):
         return self.matrix.tangent(H) + self._fibre_response(green_lagrange(H)).tangent(H)
 
     @property
-    def mu(self) -> Tensor:  # type: ignore[override]
-        """Shear modulus at rest over Young's modulus, the average over all directions [-].
-
-        (E or 1, 1), or (B, E or 1, 1).
-        """
+    def mu(self) -> Tensor:
+        """Shear modulus at rest over Young's modulus, the average over all directions [-]."""
         normal, mixed = self._fibre_traces
         return self.matrix.mu + (3 * mixed - normal) / 30
 
     @property
-    def lam(self) -> Tensor:  # type: ignore[override]
+    def lam(self) -> Tensor:
         """First Lame parameter at rest over Young's modulus, the average over directions [-].
 
         Source: Voigt (1889), Ann. Phys. 274: the average over all rotations of the moduli D has the
@@ -223,51 +219,30 @@ class FibreReinforced(Composed, Material):
 
     @property
     def _fibre_traces(self) -> tuple[Tensor, Tensor]:
-        """D_iikk and D_ikik of the moduli D of the fibres at rest, which no rotation changes.
-
-        They are (E or 1, 1), or (B, E or 1, 1).
-        """
-        matrix = _moduli(self._rest_moduli(), _REST)
+        """D_iikk and D_ikik of the moduli D of the fibres at rest, which no rotation changes."""
+        matrix = _moduli(self.fibres.moduli_at_rest)
         return matrix[..., ::4, ::4].sum((-2, -1)), matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
-
-    def _rest_moduli(self) -> tuple[Any, ...]:
-        """Return the 21 moduli of the fibres at rest."""
-        return self.fibres.strain_derivatives(self.fibres.constants, _REST)[1]
 
     def rest_stress(self, H: Tensor) -> Tensor:
         """Return the stress of small strains, see `Material.rest_stress`."""
         Q = self._rotation(H)
         strain = Q.mT @ (H + H.mT) @ Q / 2
-        D = _moduli(self._rest_moduli(), _REST).to(H)
+        D = _moduli(self.fibres.moduli_at_rest).to(H)
         S = (D @ strain.flatten(-2)[..., None])[..., 0].unflatten(-1, (3, 3))
         return self.matrix.rest_stress(H) + Q @ S @ Q.mT
 
     @property
-    def rest_moduli(self) -> Tensor:
-        """See `Material.rest_moduli`; those of the matrix, then the 21 of the fibres."""
-        matrix, own = self.matrix.rest_moduli, _tensors(self._rest_moduli(), _REST)
-        rows = [one if one.ndim == 3 else one[None] for one in own]
-        batch = torch.broadcast_shapes(matrix.shape[:1], rows[0].shape[:1])
-        fibres = [row.expand(*batch, -1, -1).flatten(1) for row in rows]
-        return torch.cat([matrix.expand(*batch, -1), *fibres], dim=1)
-
-    def linear_law(self, moduli: Tensor) -> "FibreReinforced":
-        """See `Material.linear_law`."""
-        count = self.matrix.rest_moduli.shape[1]
-        first, rest = moduli[:count], moduli[count:]
-        columns = rest.view(21, -1, 1)
-        fibres = LinearFibres(columns.flatten().tolist() if columns.shape[1] == 1 else [*columns])
-        return self.with_parts({"matrix": self.matrix.linear_law(first), "fibres": fibres})
+    def frames_of_points(self) -> Tensor:
+        """Frames, (E or 1, Q or 1, 3, 3) [-]."""
+        return self.frames if self.frames.ndim == 4 else self.frames[:, None]
 
     def _rotation(self, H: Tensor) -> Tensor:
         """Return the frames of the points, (E, Q or 1, 3, 3), or (3, 3) if all are equal.
 
         Device and type are those of H.
         """
-        frames = self.frames.to(H)
-        if frames.ndim == 4:
-            return frames
-        return frames[0] if len(frames) == 1 else frames[:, None]
+        frames = self.frames_of_points.to(H)
+        return frames[0, 0] if frames.shape[:2] == (1, 1) else frames
 
     def _fibre_response(self, E: Tensor) -> Response:
         """Return stress and moduli of the fibres at Green-Lagrange strains E (..., 3, 3)."""
@@ -275,9 +250,9 @@ class FibreReinforced(Composed, Material):
         e = components(Q.mT @ (2 * E) @ Q)
         S, D = self.fibres.strain_derivatives(self.fibres.constants, e)
         pairs = torch.einsum("...ik,...jl->...ijkl", Q, Q).flatten(-4, -3).flatten(-2)
-        moduli = pairs @ _moduli(D, e) @ pairs.mT
+        moduli = pairs @ _moduli(as_tensors(D, e)) @ pairs.mT
         moduli = moduli.unflatten(-2, (3, 3)).unflatten(-1, (3, 3))
-        return Response(Q @ _tensor(S, e) @ Q.mT, moduli)
+        return Response(Q @ _tensor(as_tensors(S, e)) @ Q.mT, moduli)
 
 
 def fibre_frames(material: Material, count: int) -> Tensor:
@@ -288,7 +263,7 @@ def fibre_frames(material: Material, count: int) -> Tensor:
         count: E, the number of cells.
     """
     laws = [
-        (law.frames if law.frames.ndim == 4 else law.frames[:, None], cells)
+        (law.frames_of_points, cells)
         for law, cells in material.groups(count)
         if isinstance(law, FibreReinforced)
     ]
@@ -299,38 +274,22 @@ def fibre_frames(material: Material, count: int) -> Tensor:
     return frames
 
 
-def _tensor(S: tuple[Any, ...], e: tuple[Tensor, ...]) -> Tensor:
+def _tensor(parts: tuple[Tensor, ...]) -> Tensor:
     """Return the symmetric tensor (..., 3, 3) of six components."""
-    parts = _tensors(S, e)
     return torch.stack([parts[v] for row in COMPONENT for v in row], -1).unflatten(-1, (3, 3))
 
 
-def _moduli(D: tuple[Any, ...], e: tuple[Tensor, ...]) -> Tensor:
-    """Return the matrix (..., 9, 9) of the pairs ij and kl of the moduli.
-
-    Args:
-        D: The 21 moduli of `FibreEnergy.strain_derivatives`.
-        e: Components of the strain.
-    """
-    parts = iter(_tensors(D, e))
+def _moduli(D: tuple[Tensor, ...]) -> Tensor:
+    """Return the matrix (..., 9, 9) of the pairs ij and kl of 21 moduli."""
+    parts = iter(D)
     upper = {(v, w): next(parts) for v in range(6) for w in range(v, 6)}
     pairs = [v for row in COMPONENT for v in row]
     entries = [upper[min(v, w), max(v, w)] for v in pairs for w in pairs]
     return torch.stack(entries, -1).unflatten(-1, (9, 9))
 
 
-def _tensors(entries: tuple[Any, ...], e: tuple[Tensor, ...]) -> list[Tensor]:
-    """Return numbers and tensors as tensors of one shape; type and device are those of e."""
-    full = [x if isinstance(x, Tensor) else torch.full_like(e[0], x) for x in entries]
-    return list(torch.broadcast_tensors(*full))
-
-
 def _check_frames(frames: Tensor) -> None:
-    """Check that frames are (E, 3, 3) or (E, Q, 3, 3) and orthonormal.
-
-    Raises:
-        ValueError: They are not.
-    """
+    """Raise a ValueError unless frames are (E, 3, 3) or (E, Q, 3, 3) and orthonormal."""
     if frames.dim() not in (3, 4) or frames.shape[-2:] != (3, 3) or not frames.numel():
         raise ValueError(
             f"directions of shape {tuple(frames.shape)} must have (cells, 3, 3) or "
