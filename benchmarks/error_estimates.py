@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.ablation import solved
 from dpl import Sample, Scene
-from dpl.data import OfflineData
+from dpl.data import DataModule
 from dpl.fem import (
     Load,
     ModalLoads,
@@ -156,9 +156,9 @@ def _scene(problem: Problem, *, n_modes: int = 5, deflection: float = 0.4) -> Sc
     return Scene(problem, loads, newton)
 
 
-def solved_data(scene: Scene, sizes: Sizes, folder: Path) -> OfflineData:
+def solved_data(scene: Scene, sizes: Sizes, folder: Path) -> DataModule:
     """Return the data set of a scene in a folder; missing loads are solved."""
-    data = OfflineData(
+    data = DataModule(
         scene, folder=str(folder), train=sizes.train, val=sizes.val, test=sizes.test, workers=0
     )
     data.prepare_data()
@@ -271,7 +271,7 @@ def measured(sim: Simulator, samples: Sample, options: Mapping[str, Any]) -> Ite
         yield Estimate("", "", "", "", answer.method, error, answer.error)
 
 
-def trained(scene: Scene, data: OfflineData, epochs: int) -> dict[str, Simulator]:
+def trained(scene: Scene, data: DataModule, epochs: int) -> dict[str, Simulator]:
     """Return simulators with surrogates of several accuracies, by name."""
     torch.manual_seed(0)
     muon = partial(Muon, lr=5e-3)

@@ -4,18 +4,18 @@ import itertools
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from dpl.data.samples import transform
 from dpl.data.solving.worker_pool import MAX_CONSECUTIVE_CRASHES, MAX_RETRIES
 from dpl.data.stream import DrawnSample, OnlineSamples
-from dpl.fem.symmetry import Symmetry, images
+from dpl.fem.symmetry import Symmetry
 from dpl.scene import Sample, stack
 from dpl.system.processes import block_signals, spawn_context
 
@@ -60,9 +60,6 @@ class ReplayBuffer:
         capacity: Number of samples that the buffer keeps.
         seed: Seed of the choice of samples and images.
         group: Symmetries of the body, identity first: each use is that of a random image.
-        errors: Returns the surrogate's errors on the last batch, (B,); called only if the stream
-            has hard examples.
-        report: Called with the rates at the end of each pass.
         produced: Number of samples taken from the stream so far.
         next_index: Upper bound of the numbers of these loads, plus one.
         rates: Rates of the last epoch; None before its end.
@@ -78,8 +75,6 @@ class ReplayBuffer:
     capacity: int
     seed: int = 0
     group: Sequence[Symmetry] = ()
-    errors: Callable[[], Tensor | None] = lambda: None
-    report: Callable[[StreamRates], None] = lambda rates: None
     produced: int = field(default=0, init=False)
     next_index: int = field(default=0, init=False)
     rates: StreamRates | None = field(default=None, init=False)
@@ -114,8 +109,21 @@ class ReplayBuffer:
                     uses=self._used / max(self.produced, 1),
                     buffer=self._buffer.size,
                 )
-                self.report(self.rates)
             yield batch
+
+    @property
+    def taken(self) -> int:
+        """Number of loads that all training processes have taken.
+
+        Other processes have taken as many samples, but may have met more rejected loads. The number
+        of loads that this process has taken beyond its samples is therefore added once more.
+        """
+        first, processes = self.stream.first, self.stream.world_size
+        taken = max(first, self.next_index)
+        if processes > 1:
+            beyond = taken - first - processes * self.produced
+            taken += processes * max(1, self.workers) + max(0, beyond)
+        return taken
 
     def _start(self) -> None:
         """Start the workers."""
@@ -159,9 +167,6 @@ class ReplayBuffer:
                     which = torch.randint(len(self.group), shape, generator=self._generator)
                     batch = transform(batch, self.group, which)
                 yield batch
-                if self.stream.hard_examples is not None:
-                    self._buffer.set_errors(chosen, self.errors())
-                    self.stream.hard_examples.update(self._buffer.hardest_points())
 
     def _next_samples(self) -> DrawnSample | None:
         """Return new samples; None at the end of a finite stream. Replace dead workers."""
@@ -197,15 +202,13 @@ class ReplayBuffer:
 
 
 class _Buffer:
-    """The last samples of a stream, each with its last error and the number of uses left."""
+    """The last samples of a stream, each with the number of uses left."""
 
     def __init__(self, capacity: int, reuse: int) -> None:
         self._capacity = capacity
         self._reuse = reuse
         self._count = 0
         self._uses_left = torch.zeros(capacity, dtype=torch.int64)
-        self._error = torch.zeros(capacity, dtype=torch.float64)
-        self._point = torch.zeros(capacity, 0, dtype=torch.float64)
         self.sample = Sample(*(torch.zeros(0) for _ in Sample._fields))
 
     @property
@@ -222,13 +225,10 @@ class _Buffer:
         """Replace the oldest samples by new ones."""
         if not self._count:  # the system provides memory when it is first written
             self.sample = Sample(*(c.new_empty(self._capacity, *c.shape[1:]) for c in new.sample))
-            self._point = new.point.new_zeros(self._capacity, new.point.shape[1])
         rows = torch.arange(self._count, self._count + len(new.number)) % self._capacity
         for column, values in zip(self.sample, new.sample, strict=True):
             column[rows] = values
         self._uses_left[rows] = self._reuse
-        self._error[rows] = 0.0
-        self._point[rows] = new.point
         self._count += len(new.number)
 
     def choose(self, count: int, generator: torch.Generator) -> Tensor:
@@ -240,22 +240,6 @@ class _Buffer:
         self._uses_left -= torch.bincount(chosen, minlength=self._capacity)
         return chosen
 
-    def set_errors(self, chosen: Tensor, errors: Tensor | None) -> None:
-        """Store the surrogate's errors on a batch."""
-        if errors is not None and len(errors) == len(chosen):
-            self._error[chosen] = errors.double().cpu()
-
-    def hardest_points(self) -> Tensor:
-        """Return the points of a tenth of the samples with errors, largest errors first, (H, d)."""
-        count = int(np.ceil(0.1 * int(self._error.count_nonzero())))
-        return self._point[self._error.argsort(descending=True)[:count]]
-
-
-def transform(batch: Sample, group: Sequence[Symmetry], which: Tensor) -> Sample:
-    """Return samples transformed by symmetries of the body, `which` of them for each, (B,)."""
-    force, displacement = (images(field, group, which) for field in batch[:2])
-    return batch._replace(force=force, displacement=displacement)
-
 
 def _ignore_interrupts(worker: int) -> None:
     """Make a worker ignore Ctrl-C, which is handled by its parent."""
@@ -266,5 +250,4 @@ def _collate(drawn: list[DrawnSample]) -> DrawnSample:
     return DrawnSample(
         stack([one.sample for one in drawn]),
         torch.stack([one.number for one in drawn]),
-        torch.stack([one.point for one in drawn]),
     )

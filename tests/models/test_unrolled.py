@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dpl.config import run_folder
-from dpl.data import OfflineData
+from dpl.data import DataModule
 from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle, solve
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
@@ -400,7 +400,7 @@ def test_the_held_out_error_is_the_mean_norm_of_the_errors_of_the_map(beam, monk
 
 def test_a_trainer_of_the_user_fits_it(beam, tmp_path):
     """Nothing is validated before the fit, also with Lightning's defaults."""
-    data = OfflineData(beam, folder=tmp_path, train=12, val=4, test=2, workers=0)
+    data = DataModule(beam, folder=tmp_path, train=12, val=4, test=2, workers=0)
     surrogate = Surrogate(Unrolled(beam, **SMALL), MSE(), beam)
     options = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     trainer = L.Trainer(max_epochs=2, accelerator="cpu", enable_model_summary=False, **options)

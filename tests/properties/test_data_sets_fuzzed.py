@@ -19,7 +19,7 @@ from safetensors.torch import load, save
 from tried import counted
 
 from dpl import DataSetError
-from dpl.data import DataSet, OfflineData, Store
+from dpl.data import DataModule, DataSet, Store
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.data.storage import store as store_module
 from dpl.data.storage.integrity import repair, verify
@@ -79,8 +79,8 @@ def copied(folder: Path) -> Iterator[Path]:
         shutil.rmtree(copy.parent)
 
 
-def opened(scene, folder: Path) -> OfflineData:
-    return OfflineData(scene, folder=str(folder), **SIZES, batch_size=4, workers=0)
+def opened(scene, folder: Path) -> DataModule:
+    return DataModule(scene, folder=str(folder), **SIZES, batch_size=4, workers=0)
 
 
 def samples(scene, folder: Path) -> dict:
