@@ -29,8 +29,8 @@ from dpl.fem import (
     solve,
 )
 from dpl.inference import Simulator
-from dpl.models import FCNN, PODNet, Unrolled
-from dpl.training import MSE, Muon, RMSELoss, Surrogate
+from dpl.models import FCNN, ClosedFormFit, PODNet, Unrolled
+from dpl.training import MSE, Muon, RMSELoss, Surrogate, fit
 
 IN_RANGE, TWICE = "in range", "twice the range"
 CALLS: Mapping[str, Mapping[str, Any]] = {
@@ -282,6 +282,9 @@ def trained(scene: Scene, data: DataModule, epochs: int) -> dict[str, Simulator]
     }
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
     for surrogate in surrogates.values():
+        if isinstance(surrogate.net, ClosedFormFit):
+            fit(surrogate, data)
+            continue
         trainer = L.Trainer(
             max_epochs=epochs, accelerator="cpu", enable_checkpointing=False,
             check_val_every_n_epoch=epochs, **quiet,

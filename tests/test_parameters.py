@@ -12,7 +12,7 @@ from laws import HOOKEAN
 
 from dpl import DataSetError, Sample
 from dpl.config import build as run
-from dpl.data import DataModule, OnlineData, Store
+from dpl.data import DataModule, Store, Stream
 from dpl.data.storage.integrity import verify
 from dpl.data.storage.shard import decode_shard
 from dpl.evaluation import evaluate
@@ -334,8 +334,8 @@ def test_verify_finds_other_poissons_ratios(sets):
 
 
 def test_images_and_streams_carry_poissons_ratios(wide, sets, tmp_path):
-    stream = OnlineData(wide, folder=str(tmp_path), val=1, test=1, workers=0, batches=1,
-                        batch_size=8, symmetry=True)  # fmt: skip
+    sizes = {"val": 1, "test": 1, "workers": 0, "batch_size": 8}
+    stream = DataModule(wide, folder=str(tmp_path), train=Stream(batches=1), symmetry=True, **sizes)
     batch = next(iter(stream.train_dataloader()))
     assert batch.parameters.shape == (8, 1)
     assert ResidualRatio(wide.problem).measure(batch.displacement, batch).max() < 1e-8

@@ -10,6 +10,7 @@ from dpl.training import checkpoints
 
 MODEL = ["model.rank=12", "model.cells=8", "model.stages=1"]
 SIZES = ["data.val=8", "data.test=4", "data.workers=0", "data.folder=data"]
+SMALL = ["data.train.max_train=20", "data.train.error=1e-9"]
 RUN = ["model=unrolled", "data=growing", "logger=csv", "run=run"]
 
 
@@ -74,7 +75,7 @@ def test_sigterm_ends_a_growing_training_with_143_and_the_command_that_resumes_i
 
 
 def test_the_set_of_a_growing_run_serves_a_run_of_given_size(train, tmp_path):
-    assert not train(*RUN, *MODEL, *SIZES, "data.train.max_train=20", "data.train.error=1e-9").status
+    assert not train(*RUN, *MODEL, *SIZES, *SMALL).status
     again = train("model=unrolled", "data.train=20", "run=other", "logger=none", *MODEL, *SIZES)
     assert not again.status, again.err
     assert "32 of 32 loads not solved again" in again.out
@@ -86,7 +87,7 @@ def test_the_set_of_a_growing_run_serves_a_run_of_given_size(train, tmp_path):
 
 
 def test_the_number_of_loads_of_a_run_is_not_that_of_its_data_set(train, tmp_path):
-    assert not train(*RUN, *MODEL, *SIZES, "data.train.max_train=20", "data.train.error=1e-9").status
+    assert not train(*RUN, *MODEL, *SIZES, *SMALL).status
     cfg, surrogate = run_folder.load_run(tmp_path / "run")
     more = OmegaConf.merge(cfg, {"data": {"train": 24}})
     assert len(run_folder.load_data(more, surrogate.scene).samples("train").force) == 24

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dpl.data import DataModule, OnlineData
+from dpl.data import DataModule
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.fem import Load, Problem, solve
 from dpl.fem.assembly import element_loops
@@ -258,19 +258,4 @@ def test_images_under_symmetries_are_not_solved(scene, folder, data, calls, monk
     module.prepare_data()
     calls.clear()
     assert sum(len(batch.force) for batch in module.train_dataloader()) == 12 * count
-    assert calls == {}
-
-
-def test_a_stream_solves_nothing_that_the_data_set_has(scene, tmp_path, calls):
-    """With cache=true."""
-    options = {"val": 1, "test": 1, "workers": 0, "batch_size": 4, "batches": 2, "new_per_round": 4}
-    made = DataModule(scene, folder=str(tmp_path / "d"), train=8, val=1, test=1, workers=0)
-    made.prepare_data()
-    module = OnlineData(scene, folder=str(tmp_path / "d"), reuse=1, cache=True, **options)
-    assert "8 loads of the stream not solved again: they are there" in module.skipped_work()
-    module.prepare_data()
-    threads = torch.get_num_threads()
-    calls.clear()
-    assert sum(len(batch.force) for batch in module.train_dataloader()) == 8
-    torch.set_num_threads(threads)
     assert calls == {}

@@ -43,7 +43,7 @@ STARTS = {
         from torch.utils.data import IterableDataset
 
         class Source(IterableDataset):
-            first, rank, world_size, offsets, hard_examples = 0, 0, 1, {}, None
+            first, rank, world_size, offsets = 0, 0, 1, {}
 
             def __iter__(self):
                 task()

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
-from dpl.data import DataModule, OnlineData
+from dpl.data import DataModule, Stream
 from dpl.fem import Load
 from dpl.models import FCNN
 from dpl.models.linear_base import sampled_solutions
@@ -456,10 +456,9 @@ def test_the_seed_determines_the_weights(scene, data, tmp_path):
 
 def test_an_interrupted_stream_continues_with_new_loads(scene, folder, data, tmp_path):
     def stream():
-        return OnlineData(
-            scene, folder=str(folder), val=4, test=4, workers=0, batch_size=4, batches=3,
-            new_per_round=4, reuse=1, capacity=16,
-        )  # fmt: skip
+        source = Stream(batches=3, new_per_round=4, reuse=1, capacity=16)
+        options = {"val": 4, "test": 4, "workers": 0, "batch_size": 4}
+        return DataModule(scene, folder=str(folder), train=source, **options)
 
     _, part = run(scene, tmp_path, stream(), stop=1)
     assert part.datamodule.state_dict() == {"next_index": 12}
