@@ -1,20 +1,17 @@
 """Sources of the training samples of a data module: a data set on disk, or an endless stream."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dpl.data.dataset import DataSet
 from dpl.data.learning_curve import CurvePoint, in_words
 from dpl.data.replay_buffer import ReplayBuffer, StreamRates
 from dpl.data.storage.store import Store
-from dpl.data.stream import OnlineSamples
+from dpl.data.stream import SampleStream
 from dpl.scene import Scene
 from dpl.system.checks import check_range
 from dpl.system.memory import machine, refuse_beyond
 from dpl.system.threads import leave_cores
-
-if TYPE_CHECKING:
-    from dpl.data.datamodule import DataModule
 
 MAX_COUNT = 10**9  # of batches, and of samples in a batch
 
@@ -39,8 +36,8 @@ class Source:
         """Return the number of loads of a data set whose samples are training samples."""
         return self.train
 
-    def loader(self, data: "DataModule") -> Iterable[Any]:
-        """Return the batches of an epoch of gradient descent."""
+    def loader(self, data: Any) -> Iterable[Any]:
+        """Return the batches of an epoch of gradient descent for a `DataModule`."""
         return data.shuffled()
 
     def fits(self, dataset: DataSet) -> Iterator[dict[str, int]]:
@@ -126,21 +123,22 @@ class Stream(Source):
         """Rates of the stream in the last epoch; None before its end."""
         return self._replay.rates if self._replay is not None else None
 
-    def loader(self, data: "DataModule") -> ReplayBuffer:
+    def loader(self, data: Any) -> ReplayBuffer:
         """Return the stream; training is limited to the cores that its workers leave."""
         leave_cores(data.workers)
         rank, world_size = data.rank_and_world_size
-        stream = OnlineSamples(
+        self.close()  # the stream of an earlier training
+        stream = SampleStream(
             data.scene,
             data.store.stream("train"),
             first=self._first,
             rank=rank,
             world_size=world_size,
+            workers=data.workers,
             timeout=data.dataset.timeout,
         )
         self._replay = ReplayBuffer(
             stream,
-            workers=data.workers,
             batch_size=data.batch_size,
             batches=self.batches,
             new_per_round=self.new_per_round,
@@ -158,7 +156,7 @@ class Stream(Source):
     def close(self) -> None:
         """Stop the workers."""
         if self._replay is not None:
-            self._replay.close()
+            self._replay.stream.close()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of loads that all training processes have taken."""

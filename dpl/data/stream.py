@@ -1,100 +1,116 @@
-"""Endless stream of samples that are drawn and solved while a network trains."""
+"""Endless stream of samples that worker processes solve while a network trains."""
 
 import itertools
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import KW_ONLY, dataclass, field
-from typing import NamedTuple
+import queue
+import threading
+from collections.abc import Generator, Iterator
+from contextlib import closing, suppress
 
 import torch
-from torch import Tensor
-from torch.utils.data import IterableDataset, get_worker_info
 
-from dpl.data.solving.solve import LoadKey, SolvedLoad, failed_load, solve_load
-from dpl.data.solving.worker_pool import STARTUP_GRACE
+from dpl.data.background import StopFlag, join
+from dpl.data.solving.solve import LoadKey, SolvedLoad
+from dpl.data.solving.worker_pool import solve_loads
 from dpl.scene import Sample, Scene
 
-
-class DrawnSample(NamedTuple):
-    """A sample, or a batch of samples, with its position in the stream.
-
-    Attributes:
-        sample: Load and solution.
-        number: Number of the load in the stream, (B,).
-    """
-
-    sample: Sample
-    number: Tensor
+AHEAD = 8  # solved loads, for each worker, that wait to be used
+MAX_EARLY = 256  # loads solved before a load of a smaller number, after which that one is left out
 
 
-@dataclass(eq=False)
-class OnlineSamples(IterableDataset):
-    """The accepted loads of an endless stream; each worker process solves its own.
+class SampleStream:
+    """The accepted loads of an endless stream, in the order of their numbers.
+
+    A thread supervises the worker processes, which solve loads ahead of their use. Without workers
+    there is no thread, and a load is solved when it is needed.
 
     Attributes:
-        scene: Scene whose loads are solved.
-        seed: Seed of the stream.
         first: Number of the first load.
-        rank: Index of this training process.
         world_size: Number of training processes, which share the stream.
-        offsets: Number of the next load of a worker, by its index among the workers of all
-            training processes; worker k starts at `first + k` by default.
-        timeout: Time limit for a load in a worker [s]; None: no limit.
+        workers: Number of worker processes of each training process.
     """
 
-    scene: Scene
-    seed: tuple[int, int]
-    first: int = 0
-    _: KW_ONLY
-    rank: int = 0
-    world_size: int = 1
-    timeout: float | None = None
-    offsets: dict[int, int] = field(default_factory=dict)
+    def __init__(
+        self,
+        scene: Scene,
+        seed: tuple[int, int],
+        *,
+        first: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+        workers: int = 0,
+        timeout: float | None = None,
+    ) -> None:
+        """Describe the stream; nothing is solved before the first sample is needed.
 
-    def __iter__(self) -> Iterator[DrawnSample]:
-        """Yield single samples, fields of shape (N, D)."""
-        info = get_worker_info()
-        worker, workers = (info.id, info.num_workers) if info else (0, 1)
-        index = self.rank * workers + worker
-        first = self.offsets.get(index, self.first + index)
-        grace = STARTUP_GRACE
-        for number in itertools.count(first, workers * self.world_size):
-            limit = self.timeout + grace if self.timeout and info is not None else None
-            solved, grace = self._solve(number, limit), 0.0
-            if solved.accepted:
-                yield self._drawn_sample(solved)
+        Args:
+            scene: Scene whose loads are solved.
+            seed: Seed of the stream.
+            first: Number of the first load.
+            rank: Index of this training process.
+            world_size: Number of training processes.
+            workers: Number of worker processes, one core each; 0: solve in this process.
+            timeout: Time limit for a load in a worker [s]; None: no limit.
+        """
+        self.first, self.world_size, self.workers = first, world_size, workers
+        self._scene, self._seed, self._rank, self._timeout = scene, seed, rank, timeout
+        self._solved: queue.Queue[SolvedLoad | BaseException] = queue.Queue(AHEAD * workers)
+        self._stop = StopFlag()
+        self._thread = threading.Thread(target=self._run, name="stream", daemon=True)
 
-    def _solve(self, number: int, limit: float | None) -> SolvedLoad:
-        """Solve a load within a time limit [s]; return it as failed beyond the limit."""
-        job = LoadKey(self.seed, number)
+    def __iter__(self) -> Iterator[tuple[int, Sample]]:
+        """Yield numbers and samples, fields of shape (N, D)."""
+        solving = self._solve_in_background() if self.workers else self._solve()
+        early: dict[int, SolvedLoad] = {}
+        for number in self._numbers():
+            while number not in early and len(early) < MAX_EARLY:
+                if (solved := next(solving, None)) is None:  # the stream has been closed
+                    return
+                if solved.job.number >= number:
+                    early[solved.job.number] = solved
+            found = early.pop(number, None)
+            if found is not None and found.accepted:
+                yield number, self._sample(found)
+
+    def _numbers(self) -> Iterator[int]:
+        return itertools.count(self.first + self._rank, self.world_size)
+
+    def _solve(self) -> Generator[SolvedLoad, None, None]:
+        jobs = (LoadKey(self._seed, number) for number in self._numbers())
+        return solve_loads(
+            self._scene, jobs, workers=self.workers, timeout=self._timeout, stop=self._stop
+        )
+
+    def _solve_in_background(self) -> Iterator[SolvedLoad]:
+        self._thread.start()
+        while not isinstance(solved := self._solved.get(), BaseException):
+            yield solved
+        raise solved
+
+    def _run(self) -> None:
+        """Solve all loads."""
         try:
-            with _time_limit(limit):
-                return solve_load(self.scene, job)
-        except TimeoutError as error:
-            return failed_load(self.scene, job, str(error))
+            with closing(self._solve()) as solving:
+                for solved in solving:
+                    self._put(solved)
+                    if self._stop:
+                        break
+        except BaseException as error:  # raised again in the thread that waits
+            self._put(error)
 
-    def _drawn_sample(self, solved: SolvedLoad) -> DrawnSample:
-        loads, point = self.scene.loads, torch.from_numpy(solved.point)[None]
-        fields = map(torch.from_numpy, (solved.force, solved.displacement))
-        sample = Sample(*fields, loads.young_at(point)[0], loads.parameters_at(point)[0])
-        return DrawnSample(sample, torch.tensor(solved.job.number))
+    def _put(self, solved: SolvedLoad | BaseException) -> None:
+        """Wait for a place in the queue until the stream is closed."""
+        while not self._stop:
+            with suppress(queue.Full):
+                self._solved.put(solved, timeout=0.1)
+                return
 
+    def _sample(self, solved: SolvedLoad) -> Sample:
+        loads, point = self._scene.loads, torch.from_numpy(solved.point)[None]
+        force, displacement = map(torch.from_numpy, (solved.force, solved.displacement))
+        return Sample(force, displacement, loads.young_at(point)[0], loads.parameters_at(point)[0])
 
-@contextmanager
-def _time_limit(seconds: float | None) -> Iterator[None]:
-    """Raise TimeoutError if the body takes longer; works in the main thread of a process only."""
-    if seconds is None:
-        yield
-        return
-
-    def stop(*_: object) -> None:
-        raise TimeoutError(f"timed out after {seconds:g} s")
-
-    previous = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, previous)
+    def close(self) -> None:
+        """End the workers as soon as one of them has solved its load."""
+        self._stop.set()
+        if self._thread.is_alive():
+            join(self._thread)

@@ -55,38 +55,45 @@ def fit(
         KeyboardInterrupt: The training was interrupted; solved loads and checkpoints are kept.
         SystemExit: After SIGTERM, with status 143.
     """
-    net, loggers = cast(ClosedFormFit, surrogate.cpu().net), trainer.loggers if trainer else []
+    net = cast(ClosedFormFit, surrogate.cpu().net)
+    loggers, callbacks = (trainer.loggers, trainer.callbacks) if trainer else ([], [])
+    if trainer is not None:
+        trainer.datamodule = data  # whose validation samples are drawn
+
+    def call(hook: str, *more: Any) -> None:
+        for one in callbacks:
+            if isinstance(one, OBSERVERS):
+                getattr(one, hook)(trainer, surrogate, *more)
+
     done = [point.e_mean for point in data.source.points]
-    best, first = min(filter(math.isfinite, done), default=math.inf), len(done)
-    fits = 0
+    best, first, step = min(filter(math.isfinite, done), default=math.inf), len(done), None
     try:
         with _exit_on_sigterm():
-            for fits, sizes in enumerate(data.source.fits(data.dataset), 1):
-                if fits == 1:
-                    _call_observers(trainer, surrogate, data, "setup", "fit")
-                    _call_observers(trainer, surrogate, data, "on_train_start")
-                    _call_observers(trainer, surrogate, data, "on_train_epoch_start")
+            for step, sizes in enumerate(data.source.fits(data.dataset), first):
+                if step == first:
+                    call("setup", "fit")
+                    call("on_train_start")
+                    call("on_train_epoch_start")
                 data.sizes |= sizes
                 net.fit(data.samples("train"), data.samples("val"))
                 errors = validation_errors(surrogate, data)
                 curve = {name: errors[f"val/{metric}"] for name, metric in METRICS.items()}
                 print(data.source.record(sizes["train"], curve), flush=True)
+                numbers = {**errors, "epoch": step, "memory/process": resident_memory()}
+                points = {f"learning_curve/{m}": errors[f"val/{m}"] for m in METRICS.values()}
                 for logger in loggers:
-                    numbers = {"epoch": first + fits - 1, "memory/process": resident_memory()}
-                    logger.log_metrics({**errors, **numbers}, step=first + fits - 1)
-                    numbers = {f"learning_curve/{m}": errors[f"val/{m}"] for m in METRICS.values()}
-                    logger.log_metrics(numbers, step=sizes["train"])
+                    logger.log_metrics(numbers, step=step)
+                    logger.log_metrics(points, step=sizes["train"])
                     logger.save()
-                if improved := curve["e_mean"] < best:
-                    best = curve["e_mean"]
+                improved, best = curve["e_mean"] < best, min(best, curve["e_mean"])
                 if folder is not None:
                     _write(surrogate, data, folder / "checkpoints", improved=improved)
-                _call_observers(trainer, surrogate, data, "on_validation_epoch_end")
-        if fits:
-            _call_observers(trainer, surrogate, data, "on_train_end")
+                call("on_validation_epoch_end")
+        if step is not None:
+            call("on_train_end")
     finally:
         data.source.close()
-        _call_observers(trainer, surrogate, data, "on_fit_end")
+        call("on_fit_end")
         for logger in loggers:
             logger.finalize("finished")
     return best
@@ -119,18 +126,6 @@ def _write(surrogate: Surrogate, data: DataModule, folder: Path, *, improved: bo
     if improved:
         checkpoints.write(checkpoint, folder / f"best{checkpoints.WEIGHTS}")
     checkpoints.write(checkpoint, folder / "last.ckpt")
-
-
-def _call_observers(
-    trainer: L.Trainer | None, surrogate: Surrogate, data: DataModule, hook: str, *more: Any
-) -> None:
-    """Call a hook of Lightning of the callbacks that observe fits."""
-    if trainer is None:
-        return
-    trainer.datamodule = data  # its validation samples are drawn
-    for one in trainer.callbacks:
-        if isinstance(one, OBSERVERS):
-            getattr(one, hook)(trainer, surrogate, *more)
 
 
 @contextmanager

@@ -331,7 +331,7 @@ def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, mo
     def choosy(scene, job):
         return solve_load(scene, job)._replace(accepted=job.number % 3 == 1)
 
-    monkeypatch.setattr("dpl.data.stream.solve_load", choosy)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", choosy)
     module = online()
     first = set(forces(module.train_dataloader()))
     resumed = online()
@@ -345,7 +345,7 @@ def test_rejected_loads_with_nan_do_not_reach_training(online, monkeypatch):
         bad = one._replace(accepted=False, reason="x", displacement=np.nan * one.displacement)
         return bad if job.number % 2 else one
 
-    monkeypatch.setattr("dpl.data.stream.solve_load", choosy)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", choosy)
     for batch in online().train_dataloader():
         assert all(torch.isfinite(column).all() for column in batch)
 

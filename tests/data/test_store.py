@@ -256,7 +256,7 @@ def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fr
     assert content(fresh) == content(data.store)
 
 
-@pytest.mark.parametrize("size", [1, 5, 1000])
+@pytest.mark.parametrize("size", [1, 5])
 def test_the_samples_do_not_depend_on_the_size_of_shards(data, fresh, monkeypatch, size):
     monkeypatch.setattr(store_module, "SHARD_SIZE", size)
     fill(fresh, WANTED)
@@ -533,17 +533,7 @@ def test_verify_finds_damaged_shards_whose_digest_is_right(data, copy, change):
     assert after == before
 
 
-IMPOSSIBLE = [
-    *({"split": "vrain"}, {"split": None}, {"file": 3}, {"file": "x" * 999}, {"file": "a\nb"}),
-    *({"file": "/dev/zero"}, {"first": -1}, {"first": "0"}, {"first": True}, {"tried": 10**12}),
-    *({"tried": 13}, {"accepted": 11}, {"iterations": None}, {"amplitudes": [1.0]}),
-    *({"amplitudes": 12 * ["a"]}, {"amplitudes": 12 * [float("nan")]}, {"rejected": None}),
-    *({"amplitudes": 12 * [10**30]}, {"sha256": None}),
-    *({"accepted": 11, "rejected": [one]} for one in ({"index": 3}, {"index": 99}, "text", 3)),
-]
-
-
-@pytest.mark.parametrize("harm", IMPOSSIBLE)
+@pytest.mark.parametrize("harm", [{"split": "vrain"}, {"file": "/dev/zero"}, {"tried": 10**12}])
 def test_an_invalid_line_of_the_manifest_is_solved_again(copy, data, harm):
     found = lines(copy)
     assert found[0]["split"] == "train"
@@ -556,8 +546,15 @@ def test_an_invalid_line_of_the_manifest_is_solved_again(copy, data, harm):
     assert content(copy) == content(data.store)
 
 
-@pytest.mark.parametrize("name", ["scene.json", "manifest.jsonl", "modes.safetensors", "shard"])
-@pytest.mark.parametrize("harm", ["a link", "a loop", "a folder", "a pipe", "huge"])
+@pytest.mark.parametrize(
+    ("name", "harm"),
+    [
+        *(("scene.json", harm) for harm in ("a link", "huge", "a folder")),
+        *(("manifest.jsonl", harm) for harm in ("a loop", "a pipe", "huge")),
+        *(("modes.safetensors", harm) for harm in ("a folder", "a link", "huge")),
+        *(("shard", harm) for harm in ("a pipe", "a loop", "huge", "a link")),
+    ],
+)
 def test_irregular_files_are_refused_by_name_and_not_read(copy, tmp_path, name, harm):
     name = lines(copy)[0]["file"] if name == "shard" else name
     path = copy.folder / name
