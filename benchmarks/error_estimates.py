@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.ablation import solved
 from dpl import Sample, Scene
-from dpl.data import OfflineData
+from dpl.data import DataModule
 from dpl.fem import (
     Load,
     ModalLoads,
@@ -29,8 +29,8 @@ from dpl.fem import (
     solve,
 )
 from dpl.inference import Simulator
-from dpl.models import FCNN, PODNet, Unrolled
-from dpl.training import MSE, Muon, RMSELoss, Surrogate
+from dpl.models import FCNN, ClosedFormFit, PODNet, Unrolled
+from dpl.training import MSE, Muon, RMSELoss, Surrogate, fit
 
 IN_RANGE, TWICE = "in range", "twice the range"
 CALLS: Mapping[str, Mapping[str, Any]] = {
@@ -156,9 +156,9 @@ def _scene(problem: Problem, *, n_modes: int = 5, deflection: float = 0.4) -> Sc
     return Scene(problem, loads, newton)
 
 
-def solved_data(scene: Scene, sizes: Sizes, folder: Path) -> OfflineData:
+def solved_data(scene: Scene, sizes: Sizes, folder: Path) -> DataModule:
     """Return the data set of a scene in a folder; missing loads are solved."""
-    data = OfflineData(
+    data = DataModule(
         scene, folder=str(folder), train=sizes.train, val=sizes.val, test=sizes.test, workers=0
     )
     data.prepare_data()
@@ -271,7 +271,7 @@ def measured(sim: Simulator, samples: Sample, options: Mapping[str, Any]) -> Ite
         yield Estimate("", "", "", "", answer.method, error, answer.error)
 
 
-def trained(scene: Scene, data: OfflineData, epochs: int) -> dict[str, Simulator]:
+def trained(scene: Scene, data: DataModule, epochs: int) -> dict[str, Simulator]:
     """Return simulators with surrogates of several accuracies, by name."""
     torch.manual_seed(0)
     muon = partial(Muon, lr=5e-3)
@@ -282,6 +282,9 @@ def trained(scene: Scene, data: OfflineData, epochs: int) -> dict[str, Simulator
     }
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
     for surrogate in surrogates.values():
+        if isinstance(surrogate.net, ClosedFormFit):
+            fit(surrogate, data)
+            continue
         trainer = L.Trainer(
             max_epochs=epochs, accelerator="cpu", enable_checkpointing=False,
             check_val_every_n_epoch=epochs, **quiet,

@@ -17,9 +17,8 @@ from dpl.version import __version__
 if TYPE_CHECKING:
     from dpl.config.run_folder import load
     from dpl.config.validation import ConfigError
-    from dpl.data.datamodule import OfflineData
+    from dpl.data.datamodule import DataModule
     from dpl.data.dataset import DataSet
-    from dpl.data.online import OnlineData
     from dpl.evaluation.report import evaluate
     from dpl.inference.answer import Answer
     from dpl.inference.hybrid import Direct, Hybrid

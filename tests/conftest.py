@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from dpl import Sample, Scene
 from dpl.config import build
-from dpl.data import OfflineData
+from dpl.data import DataModule
 from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box
 
 THREADS = int(os.environ.get("DPL_TEST_THREADS", "1"))  # see tests/matrix.py
@@ -108,20 +108,20 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def _solved(scene, folder) -> Path:
-    OfflineData(scene, folder=str(folder), train=12, val=4, test=4, workers=0).prepare_data()
+    DataModule(scene, folder=str(folder), train=12, val=4, test=4, workers=0).prepare_data()
     return folder
 
 
 @pytest.fixture
-def data(scene, _solved) -> OfflineData:
+def data(scene, _solved) -> DataModule:
     """The tiny data set: 12, 4 and 4 loads, all solved."""
-    return OfflineData(scene, folder=str(_solved), train=12, val=4, test=4, batch_size=4, workers=0)
+    return DataModule(scene, folder=str(_solved), train=12, val=4, test=4, batch_size=4, workers=0)
 
 
 @pytest.fixture(scope="session")
 def batch(scene, _solved) -> Sample:
     """Twelve solved loads."""
-    return OfflineData(scene, folder=str(_solved), train=12, val=4, test=4, workers=0).samples(
+    return DataModule(scene, folder=str(_solved), train=12, val=4, test=4, workers=0).samples(
         "train"
     )
 

@@ -11,7 +11,7 @@ from laws import HOOKEAN
 
 from dpl import DataSetError, Sample, fem
 from dpl.config import build as run
-from dpl.data import OfflineData, OnlineData, Store
+from dpl.data import DataModule, Store, Stream
 from dpl.data.storage.integrity import verify
 from dpl.data.storage.shard import decode_shard
 from dpl.evaluation import evaluate
@@ -44,13 +44,13 @@ def wide(make_scene):
 @pytest.fixture(scope="module")
 def _folder(wide, tmp_path_factory):
     folder = str(tmp_path_factory.mktemp("wide") / "set")
-    OfflineData(wide, folder=folder, train=96, val=8, test=24, workers=0).prepare_data()
+    DataModule(wide, folder=folder, train=96, val=8, test=24, workers=0).prepare_data()
     return folder
 
 
 @pytest.fixture
 def sets(wide, _folder):
-    return OfflineData(wide, folder=_folder, train=96, val=8, test=24, batch_size=16, workers=0)
+    return DataModule(wide, folder=_folder, train=96, val=8, test=24, batch_size=16, workers=0)
 
 
 @pytest.fixture
@@ -295,12 +295,12 @@ def test_verify_finds_other_poissons_ratios(sets):
 
 
 def test_images_and_streams_carry_poissons_ratios(wide, sets, tmp_path):
-    stream = OnlineData(wide, folder=str(tmp_path), val=1, test=1, workers=0, batches=1,
-                        batch_size=8, symmetry=True)  # fmt: skip
+    sizes = {"val": 1, "test": 1, "workers": 0, "batch_size": 8}
+    stream = DataModule(wide, folder=str(tmp_path), train=Stream(batches=1), symmetry=True, **sizes)
     batch = next(iter(stream.train_dataloader()))
     assert batch.parameters.shape == (8, 1)
     assert ResidualRatio(wide.problem).measure(batch.displacement, batch).max() < 1e-8
-    module = OfflineData(wide, folder=str(sets.store.folder), train=16, symmetry=True, workers=0)
+    module = DataModule(wide, folder=str(sets.store.folder), train=16, symmetry=True, workers=0)
     batch = next(iter(module.train_dataloader()))
     assert ResidualRatio(wide.problem).measure(batch.displacement, batch).max() < 1e-8
 
@@ -440,7 +440,7 @@ def test_encoded_samples_are_what_the_network_sees(wide, sets, few):
 def test_a_network_that_is_told_poissons_ratio_is_clearly_better(make_scene, tmp_path):
     """Loads of two modes on the whole boundary: three numbers and Poisson's ratio make them."""
     scene = make_scene(poisson=[0.0, 0.45], n_modes=2, patch_radius=(2.0, 2.0), deflection=0.2)
-    data = OfflineData(scene, folder=str(tmp_path), train=256, val=1, test=64, workers=0)
+    data = DataModule(scene, folder=str(tmp_path), train=256, val=1, test=64, workers=0)
     data.prepare_data()
     batch, errors = data.samples("train"), {}
     for kind in (FCNN, Untold):

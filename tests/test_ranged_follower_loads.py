@@ -7,7 +7,7 @@ import torch
 from torch.testing import assert_close
 
 from dpl import Sample, Scene
-from dpl.data import OfflineData, Store
+from dpl.data import DataModule, Store
 from dpl.data.storage.integrity import verify
 from dpl.fem import (
     ActiveStress,
@@ -255,7 +255,7 @@ def test_the_energy_loss_has_the_equilibrium_as_its_minimum(one):
 
 
 def test_data_network_and_simulator_take_the_value(name, scene, tmp_path):
-    data = OfflineData(scene, folder=str(tmp_path / "set"), train=16, val=4, test=4, workers=0)
+    data = DataModule(scene, folder=str(tmp_path / "set"), train=16, val=4, test=4, workers=0)
     data.prepare_data()
     assert [flaw for _, flaw in verify(Store(tmp_path / "set", scene, 0)) if flaw] == []
     test = data.samples("test")

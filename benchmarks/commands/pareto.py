@@ -99,7 +99,7 @@ def _solvers(cfg: DictConfig) -> tuple["dpl.Scene", dict[str, "fem.Solver"], "dp
 def trained_methods(
     cfg: DictConfig,
     runs: "Mapping[str, tuple[DictConfig, dpl.Surrogate]]",
-    data: "dpl.OfflineData",
+    data: "dpl.DataModule",
 ) -> dict[tuple[str, str], "Method"]:
     """Return POD-Galerkin, the networks and the corrected networks, by name and variant.
 
@@ -115,7 +115,7 @@ def trained_methods(
     if cfg.galerkin:
         found["POD-Galerkin", ""] = _made(cfg, "galerkin", data.scene, data.snapshots())
     for name, (trained, surrogate) in runs.items():
-        loads = config.training_loads(trained, data.scene)
+        loads = config.training_loads(trained)
         plain = methods.network(surrogate, Path(cfg.run) / name, loads)
         found[name, ""] = plain
         if cfg.corrected and isinstance(surrogate.net, models.Correctable):

@@ -176,13 +176,12 @@ def apply_extras(cfg: DictConfig) -> None:
         print(OmegaConf.to_yaml(cfg, resolve=True))
 
 
-def check_trainer(trainer: Any, cfg: DictConfig, *, has_schedule: bool = True) -> None:
+def check_trainer(trainer: Any, cfg: DictConfig) -> None:
     """Check a trainer against the rest of a configuration before the training.
 
     Args:
         trainer: The trainer.
         cfg: The configuration.
-        has_schedule: Whether the training uses `scheduler`; a fit in one step does not.
 
     Raises:
         ConfigError: A learning-rate schedule over an unlimited training, callbacks that write no
@@ -192,7 +191,7 @@ def check_trainer(trainer: Any, cfg: DictConfig, *, has_schedule: bool = True) -
 
     from dpl.training import checkpoints
 
-    if has_schedule and cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
+    if cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
         _check_schedule_in_time(cfg)
     if not trainer.fast_dev_run and not any(
         checkpoints.writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks

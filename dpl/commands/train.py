@@ -13,51 +13,43 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import dpl
-from dpl import config, evaluation, models, training
+from dpl import config, data, evaluation, models, training
 from dpl.commands import cli
 from dpl.system.files import DataSetError
 
 
-def parts(cfg: DictConfig) -> tuple["dpl.Scene", Any, "dpl.Surrogate", Any]:
+def parts(cfg: DictConfig) -> tuple["dpl.Scene", "data.DataModule", "dpl.Surrogate", Any]:
     """Return scene, data, surrogate and trainer of a run without solving or writing."""
     resumed = config.check_resumed(cfg)
     scene = config.build_scene(config.with_files_of_resumed(cfg))
-    data = config.instantiate(cfg, "data", scene=scene)
+    module = config.instantiate(cfg, "data", scene=scene)
     surrogate = config.build_surrogate(cfg, scene)
-    _check_data(surrogate, data)
+    _check_data(surrogate, module.source)
     if resumed is not None:
-        config.check_weights(surrogate, resumed, grows=data.growth is not None)
+        grows = isinstance(module.source, data.Growing)
+        config.check_weights(surrogate, resumed, grows=grows)
+        if grows:
+            with config.error_in("ckpt_path", LookupError, TypeError, ValueError):
+                module.load_state_dict(resumed["DataModule"])
     trainer = config.build_trainer(cfg)
-    has_schedule = not isinstance(surrogate.net, models.ClosedFormFit)
-    cli.check_trainer(trainer, cfg, has_schedule=has_schedule)
-    if resumed is not None:
-        config.check_callbacks(trainer, resumed)
-    if data.growth is not None:
-        _check_trainer_of_growth(trainer)
-    return scene, data, surrogate, trainer
+    if not isinstance(surrogate.net, models.ClosedFormFit):
+        cli.check_trainer(trainer, cfg)
+        if resumed is not None:
+            config.check_callbacks(trainer, resumed)
+    return scene, module, surrogate, trainer
 
 
-def _check_data(surrogate: "dpl.Surrogate", data: Any) -> None:
-    """Raise a `ConfigError` if a model cannot be trained on this kind of data."""
+def _check_data(surrogate: "dpl.Surrogate", source: "data.Source") -> None:
+    """Raise a `ConfigError` if a model cannot be trained on samples of this source."""
     name = type(surrogate.net).__name__
     if not isinstance(surrogate.net, models.ClosedFormFit):
-        if data.growth is not None:
+        if isinstance(source, data.Growing):
             raise config.ConfigError(
-                f"data.train = auto needs a model that is fitted, such as unrolled; {name} is "
-                "trained by gradient descent: set data.train to a number"
+                f"data=growing needs a model that is fitted, such as unrolled; {name} is trained "
+                "by gradient descent: set data.train to a number"
             )
-    elif data.growth is None and not data.dataset.train:
+    elif isinstance(source, data.Stream):
         raise config.ConfigError(f"data: {name} is fitted to solved loads; set data=offline")
-
-
-def _check_trainer_of_growth(trainer: Any) -> None:
-    """Raise a `ConfigError` if a trainer cannot train on a data set that grows."""
-    if trainer.world_size > 1:
-        raise config.ConfigError("data.train = auto needs one process; set trainer.devices=1")
-    if trainer.limit_val_batches == 0:
-        raise config.ConfigError(
-            "data.train = auto needs held-out errors; set trainer.limit_val_batches above 0"
-        )
 
 
 @cli.command("train", rehearse=parts)
@@ -81,23 +73,29 @@ def _train(cfg: DictConfig) -> float | None:
     from lightning.pytorch.loggers import TensorBoardLogger
 
     folder = Path(cfg.folder)
-    scene, data, surrogate, trainer = parts(cfg)
+    scene, module, surrogate, trainer = parts(cfg)
     session = training.LogHyperparameters(config.hyperparameters(cfg))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
         hydra = HydraConfig.get()
         first = hydra.mode != RunMode.MULTIRUN or hydra.job.num == 0
-        config.show_plan(scene, data, surrogate, folder=_from_here(folder), skipped=first)
+        config.show_plan(scene, module, surrogate, folder=_from_here(folder), skipped=first)
         if not trainer.fast_dev_run:
             config.save_config(cfg, folder)
+    smallest: float | None = None
     try:
-        trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path or None, weights_only=True)
-    except SystemExit as leaving:  # Lightning turns Ctrl-C and SIGTERM into it, without the status
+        if isinstance(surrogate.net, models.ClosedFormFit):
+            smallest = _fit(surrogate, module, trainer, folder)
+        else:
+            path = cfg.ckpt_path or None
+            trainer.fit(surrogate, datamodule=module, ckpt_path=path, weights_only=True)
+    except (SystemExit, KeyboardInterrupt) as leaving:
+        # Lightning turns Ctrl-C and SIGTERM into SystemExit, without the status
         if trainer.is_global_zero and session.begun:
             words = [_script("train"), _run_key(folder), "ckpt_path=last", *session_overrides()]
             print(f"to resume: {' '.join(words)}", file=sys.stderr)
         terminated = 128 + signal.SIGTERM
-        if trainer.received_sigterm or leaving.code == terminated:
+        if trainer.received_sigterm or getattr(leaving, "code", None) == terminated:
             sys.exit(terminated)
         raise KeyboardInterrupt from leaving
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
@@ -107,7 +105,7 @@ def _train(cfg: DictConfig) -> float | None:
         reason = f"cannot be resumed: {type(error).__name__}: {error}"
         raise config.ConfigError(f"ckpt_path = {cfg.ckpt_path} {reason}") from error
     finally:
-        data.teardown("fit")  # Lightning does not call it after Ctrl-C
+        module.teardown("fit")  # Lightning does not call it after Ctrl-C
     if torch.distributed.is_initialized():  # only the first process evaluates
         torch.distributed.destroy_process_group()
     if not trainer.is_global_zero or trainer.fast_dev_run:
@@ -127,7 +125,17 @@ def _train(cfg: DictConfig) -> float | None:
         show_next_commands(folder, tensorboard=logs)
     if (cfg.get("extras") or {}).get("view"):
         _view(best, folder)
-    return cli.best_error(trainer)
+    return cli.best_error(trainer) if smallest is None else smallest
+
+
+def _fit(
+    surrogate: "dpl.Surrogate", module: "data.DataModule", trainer: Any, folder: Path
+) -> float:
+    """Fit a model in closed form, in the first of several processes; return its smallest error."""
+    if not trainer.is_global_zero:
+        return math.inf
+    kept = None if trainer.fast_dev_run else folder
+    return training.fit(surrogate, module, trainer=trainer, folder=kept)
 
 
 def _view(surrogate: "dpl.Surrogate", folder: Path) -> NoReturn:

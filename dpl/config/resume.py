@@ -31,7 +31,8 @@ MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
     *MACHINE,
     *("trainer.log_every_n_steps", "trainer.check_val_every_n_epoch", "trainer.profiler"),
     *("trainer.enable_progress_bar", "trainer.enable_model_summary"),
-    *("data.workers", "data.timeout", "data.error", "data.minutes", "data.max_train", "tags"),
+    *("data.workers", "data.timeout", "tags"),
+    *(f"data.train.{limit}" for limit in ("error", "minutes", "max_train")),
 }
 
 
@@ -73,7 +74,8 @@ def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
 
     It is `cfg`, that of the command line, where no run is resumed, and where the command line names
     an option that changes several groups, such as `experiment`: it then has to repeat all of them.
-    An option of the group `trainer` changes the machine alone.
+    An option of the group `trainer` changes the machine alone, one of the group `data` nothing if
+    the run has the same kind of data: it lets keys of this kind be given.
 
     Raises:
         ConfigError: The configuration of the run cannot be read, or it calls an object outside this
@@ -98,11 +100,17 @@ def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
             (OmegaConf.select(found, owner) if owner else found).pop(name, None)
         elif root not in requested:
             return cfg
-        else:
+        elif key != "data" or _kind_of_data(found) != _kind_of_data(given):
             machine = [one for one in MACHINE if OmegaConf.select(given, one) is not None]
             for place in machine if key == "trainer" else [key]:
                 OmegaConf.update(found, place, OmegaConf.select(given, place), merge=False)
     return found
+
+
+def _kind_of_data(cfg: DictConfig) -> Any:
+    """Return the class of the source of the training samples; None for a number of loads."""
+    train = OmegaConf.select(cfg, "data.train")
+    return train.get("_target_") if isinstance(train, DictConfig) else None
 
 
 def with_files_of_resumed(cfg: DictConfig) -> DictConfig:

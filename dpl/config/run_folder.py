@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
 import torch
@@ -131,8 +131,8 @@ def load_run(
 ) -> tuple[DictConfig, "training.Surrogate"]:
     """Return the configuration and the best surrogate of a training run.
 
-    If the run has chosen its number of training loads (`data.train=auto`), that of the best fit
-    replaces `auto` in the configuration.
+    If the run has chosen its number of training loads (`data=growing`), the number of the best fit
+    replaces `data.train` in the configuration.
 
     Args:
         folder: Folder of the run.
@@ -157,8 +157,7 @@ def load_run(
         cfg = with_own_data(cfg, Path(folder))
     with usable(best):
         checkpoint = checkpoints.read(best)
-        points = checkpoint.get("OfflineData", {}).get("points")
-        if points and OmegaConf.select(cfg, "data.train") == "auto":
+        if points := checkpoint.get(checkpoints.DATA, {}).get("points"):
             cfg.data.train = int(points[-1][0])
     scene = _scene_of_run(cfg, best, checkpoint, scene, trust=trust)
     surrogate = build_surrogate(cfg, scene)
@@ -261,22 +260,14 @@ def load_runs(
     return runs
 
 
-def load_data(cfg: DictConfig, scene: Scene) -> "data.OfflineData":
+def load_data(cfg: DictConfig, scene: Scene) -> "data.DataModule":
     """Return the data set of a training run on its scene; missing loads are solved."""
-    found: data.OfflineData = instantiate(cfg, "data", scene=scene)
+    found: data.DataModule = instantiate(cfg, "data", scene=scene)
     found.prepare_data()
     return found
 
 
-def training_loads(cfg: DictConfig, scene: Scene) -> int | None:
-    """Return the number of training loads of a run; None for a stream.
-
-    Args:
-        cfg: Configuration of the run from `load_run`. If `data.train` is still `auto`, the run has
-            not stored its number of loads, and the loads of its data set are counted.
-        scene: Scene of the run.
-    """
-    count: int | str | None = cfg.data.get("train")
-    if count == "auto":
-        return len(instantiate(cfg, "data", scene=scene).store.tried("train"))
-    return cast("int | None", count)
+def training_loads(cfg: DictConfig) -> int | None:
+    """Return the number of training loads in a configuration from `load_run`; None for a stream."""
+    train = cfg.data.train
+    return train if isinstance(train, int) else None

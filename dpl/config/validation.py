@@ -69,7 +69,7 @@ EXPECTED_TYPES = {  # base classes of the object that the call under a key retur
     },
     "solver": {"dpl.fem.solvers.reference.ReferenceSolver"},
     "loads": {"dpl.fem.loads.family.LoadFamily"},
-    "data": {"dpl.data.dataset.DataSet", "dpl.data.datamodule.OfflineData"},
+    "data": {"dpl.data.dataset.DataSet", "dpl.data.datamodule.DataModule"},
     "model": {"torch.nn.modules.module.Module"},
     "loss": {"dpl.training.losses.loss.Loss"},
     "optimizer": {"torch.optim.optimizer.Optimizer"},
@@ -80,13 +80,14 @@ EXPECTED_TYPES = {  # base classes of the object that the call under a key retur
 }
 CLASSES_OF_DATA = {  # base class of `data`, by a key of the commands that need it
     "action": "dpl.data.dataset.DataSet",
-    "trainer": "dpl.data.datamodule.OfflineData",
+    "trainer": "dpl.data.datamodule.DataModule",
 }
 PARTS = {  # base classes of the objects that a call in the file of a run may contain
     *EXPECTED_TYPES["mesh"] | EXPECTED_TYPES["material"] | EXPECTED_TYPES["loads"] | REGIONS,
     "dpl.fem.materials.parameters.CellField",
     "dpl.fem.materials.fibres.energies.FibreEnergy",
     "dpl.fem.materials.fibres.reinforced.FibreDirections",
+    "dpl.data.sources.Source",
     "dpl.training.losses.loss.Loss",
     "lightning.fabric.plugins.io.checkpoint_io.CheckpointIO",
     "numpy.ndarray",
@@ -383,6 +384,8 @@ def _describe(hint: Any) -> str:
         return f"a mapping, each {_describe(arguments[1])}"
     if origin is Sequence:
         return f"a list, each {_describe(arguments[0])}"
+    if isinstance(hint, type) and hint not in names:
+        return f"a call that returns a {hint.__name__}"
     return names.get(hint, str(hint))
 
 

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.data.datamodule import OfflineData, Samples
+    from dpl.data.datamodule import DataModule
     from dpl.data.dataset import DataSet
-    from dpl.data.online import OnlineData
-    from dpl.data.replay_buffer import ReplayBuffer
+    from dpl.data.growing import Growing
+    from dpl.data.samples import Samples
+    from dpl.data.sources import Source, Stored, Stream
     from dpl.data.storage.store import Store
-    from dpl.data.stream import OnlineSamples
     from dpl.system.files import DataSetError
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -17,7 +17,7 @@ REFRESH = 0.5  # time between two updates of the progress bar [s]
 PATIENCE = 1.0  # time after which the end of the solves in progress is announced [s]
 
 
-class _StopFlag(threading.Event):
+class StopFlag(threading.Event):
     """Event that is its own truth value."""
 
     def __bool__(self) -> bool:
@@ -44,7 +44,7 @@ class BackgroundSolver:
         self._tried = {split: dataset.store.tried(split) for split in STREAMS}
         self._first = dict.fromkeys(STREAMS, 0)  # all loads before these have been tried
         self._changed = threading.Condition()
-        self._stop = _StopFlag()
+        self._stop = StopFlag()
         self._ended = False
         self._error: BaseException | None = None
         self._solving = self._solve()
@@ -142,7 +142,12 @@ class BackgroundSolver:
             while self._advance():  # writes the last shard
                 pass
             return
-        self._thread.join(PATIENCE)
-        if self._thread.is_alive():
-            print("Finishing the solves in progress. Press Ctrl-C again to abort.", file=sys.stderr)
-        self._thread.join()
+        join(self._thread)
+
+
+def join(thread: threading.Thread) -> None:
+    """Wait for the end of a thread that supervises workers; announce solves that take long."""
+    thread.join(PATIENCE)
+    if thread.is_alive():
+        print("Finishing the solves in progress. Press Ctrl-C again to abort.", file=sys.stderr)
+    thread.join()

@@ -1,106 +1,78 @@
-"""Lightning data module of a data set on disk."""
+"""Lightning data module of a data set and a source of training samples."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.trainer.states import TrainerFn
 from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
 
 from dpl.data.dataset import DataSet
-from dpl.data.growth import Growth
-from dpl.data.replay_buffer import ReplayBuffer, transform
+from dpl.data.samples import Samples
+from dpl.data.sources import MAX_COUNT, Source, Stored
 from dpl.fem import symmetries
 from dpl.fem.symmetry import Symmetry
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
-from dpl.system.threads import leave_cores
-
-MAX_COUNT = 10**9  # of batches, and of samples in a batch
 
 
-class Samples(Dataset):
-    """Samples in memory and their images under symmetries, read a batch at a time."""
+class DataModule(L.LightningDataModule):
+    """Validation and test samples of a data set on disk, and training samples of a source.
 
-    def __init__(self, samples: Sample, group: Sequence[Symmetry] = ()) -> None:
-        """Store the samples, (B, ...), and the symmetries of their body, identity first."""
-        self.samples = samples
-        self.group = group
-
-    def __len__(self) -> int:
-        """Return B times the number of symmetries."""
-        return len(self.samples.force) * max(1, len(self.group))
-
-    def __getitems__(self, indices: list[int]) -> Sample:
-        """Return a batch."""
-        count = len(self.samples.force)
-        batch = Sample(*(column[[i % count for i in indices]] for column in self.samples))
-        if not self.group:
-            return batch
-        return transform(batch, self.group, torch.tensor([i // count for i in indices]))
-
-
-class OfflineData(L.LightningDataModule):
-    """A data set on disk; loads that are missing are solved first.
-
-    With `train="auto"` training loads are solved while a model is fitted, see `Growth`; each epoch
-    has more of them.
+    Loads of the data set that are missing are solved by `prepare_data`.
 
     Attributes:
-        dataset: The data set; without training loads if their number is chosen by `growth`.
+        dataset: The data set.
         store: Its files.
-        growth: Choice of the number of training loads; None if that is given.
-        sizes: Present number of loads of each split.
+        source: Source of the training samples.
+        sizes: Number of loads of each split that are read from the data set.
     """
 
     def __init__(
         self,
         scene: Scene,
         *,
+        train: int | Source = 1000,
+        val: int = 100,
+        test: int = 100,
         folder: str | None = None,
         seed: int = 0,
         shuffle_seed: int = 0,
-        train: int | Literal["auto"] = 1000,
-        val: int = 100,
-        test: int = 100,
         batch_size: int = 64,
         symmetry: bool = False,
         workers: int = 2,
         timeout: float | None = 600.0,
-        error: float = 1e-3,
-        minutes: float | None = None,
-        max_train: int = 10_000,
     ) -> None:
-        """Check the arguments, those of `DataSet` and `Growth` and the following.
-
-        Nothing is read or solved before `prepare_data`.
+        """Check the arguments, those of `DataSet` and the following; nothing is read or solved.
 
         Args:
-            train: Number of loads to train on; "auto": the growth of the data set chooses it.
-            shuffle_seed: Seed of the order of the batches.
+            scene: Scene of the loads.
+            train: Source of the training samples; a number stands for `Stored`.
+            val: Number of loads to validate on.
+            test: Number of loads to test on.
+            folder: Folder of the data set.
+            seed: Seed of the loads.
+            shuffle_seed: Seed of the choice and the order of the samples for the batches.
             batch_size: Samples in a batch.
             symmetry: Train also on the images of each sample under the symmetries of the body.
-
-        Raises:
-            ValueError: A number is out of range.
+            workers: Number of processes that solve, one core each; 0: solve in this process.
+            timeout: Time limit for a load [s]; None: no limit.
         """
         super().__init__()
         check_range(1, MAX_COUNT, val=val, test=test, batch_size=batch_size)
         check_range(0, 2**32 - 1, shuffle_seed=shuffle_seed)
-        count = 0 if train == "auto" else train
-        self.dataset = DataSet(scene, folder, seed, count, val, test, workers, timeout)
-        growth = Growth(self.dataset, error=error, minutes=minutes, max_train=max_train)
-        self.growth = growth if train == "auto" else None
+        self.source = train if isinstance(train, Source) else Stored(train)
+        self.source.check(scene, batch_size)
+        self.dataset = DataSet(scene, folder, seed, self.source.train, val, test, workers, timeout)
         self.sizes = dict(self.dataset.sizes)
         self.store = self.dataset.store
         self.scene = scene
         self.batch_size = batch_size
         self.workers = workers
         self.symmetry = symmetry
-        self._shuffle_seed = shuffle_seed
+        self.shuffle_seed = shuffle_seed
         self._loaded: dict[str, tuple[int, Sample]] = {}  # with the number of loads tried
 
     @cached_property
@@ -124,17 +96,9 @@ class OfflineData(L.LightningDataModule):
         return lines
 
     def prepare_data(self) -> None:
-        """Solve the missing loads; those of a growing data set are solved during the training."""
-        if self.growth is not None:
-            if self.trainer is not None and self.trainer.state.fn == TrainerFn.FITTING:
-                return
-            self.sizes["train"] = len(self.store.tried("train"))
+        """Solve the missing loads."""
+        self.sizes["train"] = self.source.count(self.store)
         self.dataset.fill()
-
-    def setup(self, stage: str) -> None:
-        """Let the loaders of a growing data set be made again in each epoch."""
-        if self.growth is not None and stage == "fit" and self.trainer is not None:
-            self.trainer.reload_dataloaders_every_n_epochs = 1
 
     def samples(self, split: str) -> Sample:
         """Return a split, (B, ...) in float64; each load is read once."""
@@ -158,22 +122,23 @@ class OfflineData(L.LightningDataModule):
         trainer = self.trainer
         return (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
 
-    def train_dataloader(self) -> DataLoader | ReplayBuffer:
-        """Return shuffled batches of samples and their images, or of the module's encoding of them.
+    def train_dataloader(self) -> Iterable[Any]:
+        """Return the batches of an epoch from the source."""
+        return self.source.loader(self)
 
-        The order is a function of `shuffle_seed` and epoch, so that a run can be resumed. A growing
-        data set waits for the loads of the epoch.
+    def shuffled(self) -> DataLoader:
+        """Return shuffled batches of stored samples and their images, or of their encoding.
+
+        The order is a function of `shuffle_seed` and epoch, so that a run can be resumed. The
+        module that is trained may encode the samples.
         """
-        if self.growth is not None:
-            leave_cores(self.workers)
-            self.sizes |= self.growth.next_sizes()
         module, samples = getattr(self.trainer, "lightning_module", None), self.samples("train")
         encode = getattr(module, "encode", lambda samples, group: None)
         data = encode(samples, self.group)
         if data is None:
             data = Samples(samples, self.group)
         rank, world_size = self.rank_and_world_size
-        seed = self._shuffle_seed
+        seed = self.shuffle_seed
         sampler: DistributedSampler = DistributedSampler(data, world_size, rank, seed=seed)
         return self._loader(data, sampler)
 
@@ -186,20 +151,16 @@ class OfflineData(L.LightningDataModule):
         return self._loader(Samples(self.samples("test")))
 
     def teardown(self, stage: str) -> None:
-        """End the workers of a growing data set."""
-        if self.growth is not None:
-            self.growth.close()
+        """End the workers of the source."""
+        self.source.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the growth."""
-        return {} if self.growth is None else self.growth.state_dict()
+        """Return the state of the source."""
+        return self.source.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue the growth of an interrupted training."""
-        if self.growth is not None:
-            self.growth.load_state_dict(state_dict)
-            if self.growth.is_finished and self.trainer is not None:
-                self.trainer.should_stop = True
+        """Let the source continue from the state of an interrupted training."""
+        self.source.load_state_dict(state_dict)
 
     def _loader(self, data: Dataset, sampler: DistributedSampler | None = None) -> DataLoader:
         return DataLoader(

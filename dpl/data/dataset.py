@@ -229,21 +229,6 @@ class DataSet:
                 with suppress(OSError):  # it is not empty
                     store.pending.folder.rmdir()
 
-    def collect(self, split: str) -> None:
-        """Write the pending loads of a split that make whole shards.
-
-        Raises:
-            DataSetError: Another process writes there.
-        """
-        store = self.store
-        with exclusive_lock(store.folder, self.shard, self.shards):
-            pending = store.pending.files()
-            mine = {job for job in pending if job.seed == store.stream(split)}
-            count = max((job.number for job in mine), default=-1) + 1
-            found = runs(store.missing(split, count), whole=True)
-            files = [[LoadKey(store.stream(split), number) for number in run] for run in found]
-            self._write_complete_shards([file for file in files if mine.issuperset(file)], pending)
-
     def _write_complete_shards(
         self, files: list[list[LoadKey]], pending: dict[LoadKey, Path]
     ) -> None:

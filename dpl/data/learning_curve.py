@@ -1,7 +1,7 @@
 """Learning curve: held-out errors against the number of training loads."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,10 +30,8 @@ class CurvePoint(NamedTuple):
 
     def __str__(self) -> str:
         """Return the point in words."""
-        return (
-            f"{self.loads} loads, {self.seconds:.0f} s: median {_percent(self.median)}, "
-            f"worst {_percent(self.worst)}, e_mean {self.e_mean:.1e}"
-        )
+        errors = {"median": self.median, "worst": self.worst, "e_mean": self.e_mean}
+        return f"{self.loads} loads, {self.seconds:.0f} s: {in_words(errors)}"
 
 
 def loads_for(points: Sequence[CurvePoint], error: float) -> int | None:
@@ -65,6 +63,12 @@ def describe(points: Sequence[CurvePoint], error: float) -> str:
     if needed is None:
         return str(last)
     return f"{last}; about {_rounded(max(needed, last.loads + 1))} loads for {_percent(error)}"
+
+
+def in_words(errors: Mapping[str, float]) -> str:
+    """Return the `median`, `worst` and `e_mean` of a fit in words."""
+    median, worst = _percent(errors["median"]), _percent(errors["worst"])
+    return f"median {median}, worst {worst}, e_mean {errors['e_mean']:.1e}"
 
 
 def _percent(ratio: float) -> str:

@@ -69,7 +69,7 @@ class ClosedFormFit(Protocol):
     """A model without trained parameters, which is fitted to all samples at once.
 
     It takes dimensionless forces and returns displacements over L, both float64.
-    `dpl.training.ClosedFormTraining` fits it in place of a training by gradient descent.
+    `dpl.training.fit` fits it in place of a training by gradient descent.
     """
 
     def fit(self, samples: Sample, held_out: Sample) -> None:

@@ -6,13 +6,13 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.training.callbacks.averaged_weights import AveragedWeights
-    from dpl.training.callbacks.closed_form import ClosedFormTraining
     from dpl.training.callbacks.nonfinite_gradients import Diverged, SkipNonFiniteGradients
     from dpl.training.callbacks.tensorboard import LogHyperparameters, LogLearningRate
     from dpl.training.callbacks.throughput import ThroughputMonitor
     from dpl.training.callbacks.training_time import TrainingTime
     from dpl.training.callbacks.worst_cases import WorstCasePlots
     from dpl.training.checkpoints import AtomicCheckpointIO, BestWeights
+    from dpl.training.closed_form import fit
     from dpl.training.losses.energy import EnergyNormLoss, PotentialEnergyLoss
     from dpl.training.losses.loss import BlendedLoss, Loss, LossContext
     from dpl.training.losses.residual import LrPlus, LrStar

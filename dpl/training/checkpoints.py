@@ -25,9 +25,8 @@ from safetensors.torch import save
 from dpl.system.files import atomic_write
 
 WEIGHTS = ".safetensors"
-# keys of a checkpoint that are stored in the JSON header; the last one is the learning curve of a
-# growing data set
-HEADER = ("scene", "identity", "nodes", "epoch", "global_step", "OfflineData")
+DATA = "DataModule"  # key of the state of the data module, such as a learning curve
+HEADER = ("scene", "identity", "nodes", "epoch", "global_step", DATA)  # keys of the JSON header
 # files from which a run is loaded, by priority; a short run has only its last checkpoint
 LOADABLE = (f"best{WEIGHTS}", "best.ckpt", "last.ckpt")
 RESUME_KEYS = {"loops", "callbacks", "optimizer_states", "lr_schedulers"}

@@ -1,6 +1,5 @@
 """The LightningModule: a network with scales, loss, metrics and optimiser."""
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Self, cast
 
@@ -15,7 +14,6 @@ from dpl.models.protocols import ClosedFormFit, HasBase, TrainsInCoordinates
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
 from dpl.training.callbacks.averaged_weights import AveragedWeights
-from dpl.training.callbacks.closed_form import ClosedFormTraining
 from dpl.training.linear_samples import LinearBatch, LinearSamples, linear_solutions
 from dpl.training.losses.loss import Loss, LossContext
 from dpl.training.losses.supervised import SquaredErrorLoss
@@ -39,7 +37,6 @@ class Surrogate(L.LightningModule):
         base: The linear solutions that the output of the network is added to; None without.
         scene: The scene.
         loss: The loss.
-        batch_errors: Relative L2 errors of the last training batch, (B,); None before the first.
     """
 
     def __init__(
@@ -71,7 +68,6 @@ class Surrogate(L.LightningModule):
         self.net, self.loss, self.scene = net, loss, scene
         self._is_closed_form = isinstance(net, ClosedFormFit)
         self._has_coordinates = isinstance(net, TrainsInCoordinates)
-        self.batch_errors: Tensor | None = None
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
         stresses = scene.problem.follower_loads.ranges
@@ -186,21 +182,14 @@ class Surrogate(L.LightningModule):
     def _trains_in_coordinates(self) -> bool:
         return self._has_coordinates and isinstance(self.loss, SquaredErrorLoss)
 
-    def training_step(
-        self, batch: Sample | LinearBatch | ReducedSamples, batch_idx: int
-    ) -> Tensor | None:
-        """Return the loss of a batch, (); None for a model that has been fitted."""
-        if self._is_closed_form:
-            return None
+    def training_step(self, batch: Sample | LinearBatch | ReducedSamples, batch_idx: int) -> Tensor:
+        """Return the loss of a batch, ()."""
         if isinstance(batch, ReducedSamples):
             loss = self._reduced_loss(batch)
         else:
             linear, sample = batch if isinstance(batch, LinearBatch) else (None, batch)
             prediction = self.predict(sample.load, linear)
             loss = self.loss(prediction, sample, self.physics)
-            error = (prediction.detach() - sample.displacement).flatten(1).norm(dim=1)
-            size = sample.displacement.flatten(1).norm(dim=1)
-            self.batch_errors = error / size.clamp(min=1e-12)
         self.log("loss/train", loss, prog_bar=True, batch_size=len(batch[0]))
         return loss
 
@@ -302,8 +291,8 @@ class Surrogate(L.LightningModule):
         return self
 
     def configure_callbacks(self) -> list[L.Callback]:
-        """Return the loss, which is a callback, and that of a model without gradient descent."""
-        return [self.loss, ClosedFormTraining()] if self._is_closed_form else [self.loss]
+        """Return the loss, which is a callback."""
+        return [self.loss]
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Let the weights be validated with which the training ends."""
@@ -315,11 +304,14 @@ class Surrogate(L.LightningModule):
             trainer.check_val_every_n_epoch = 1
 
     def configure_optimizers(self) -> Any:
-        """Return the optimiser with its schedule; None without parameters."""
+        """Return the optimiser with its schedule.
+
+        Raises:
+            TypeError: The network is fitted in closed form.
+        """
         if self._is_closed_form:
-            for message in (".*configure_optimizers. returned .None", ".*training_step. returned"):
-                warnings.filterwarnings("ignore", message)
-            return None
+            name = type(self.net).__name__
+            raise TypeError(f"{name} has no gradient descent; call dpl.training.fit")
         optimizer = self._optimizer(self.parameters())
         if self._scheduler is None:
             return optimizer

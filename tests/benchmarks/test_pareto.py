@@ -130,7 +130,12 @@ def test_reduced_models_of_a_run_on_a_stream_are_made_from_its_validation_loads(
     script, tiny_training, tmp_path
 ):
     kept = [one for one in tiny_training if not one.startswith("data.train")]
-    stream = ["data=online", "data.batches=1", "data.capacity=8", "trainer.max_epochs=1"]
+    stream = [
+        "data=online",
+        "data.train.batches=1",
+        "data.train.capacity=8",
+        "trainer.max_epochs=1",
+    ]
     ended = script("train", *stream, *kept, "run=runs/e/a", cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
     ended = script("pareto", "run=runs/e", "galerkin.rank=4", cwd=tmp_path)

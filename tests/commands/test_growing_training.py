@@ -1,4 +1,4 @@
-"""Training on a data set that grows: `train.py model=unrolled data.train=auto`."""
+"""Training on a data set that grows: `train.py model=unrolled data=growing`."""
 
 import json
 
@@ -10,7 +10,8 @@ from dpl.training import checkpoints
 
 MODEL = ["model.rank=12", "model.cells=8", "model.stages=1"]
 SIZES = ["data.val=8", "data.test=4", "data.workers=0", "data.folder=data"]
-RUN = ["model=unrolled", "data.train=auto", "logger=csv", "run=run"]
+SMALL = ["data.train.max_train=20", "data.train.error=1e-9"]
+RUN = ["model=unrolled", "data=growing", "logger=csv", "run=run"]
 
 
 @pytest.fixture
@@ -24,23 +25,23 @@ def train(script, tiny, tmp_path):
 
 
 def test_a_run_fits_until_its_end_and_is_resumed_with_more_loads(train, tmp_path):
-    done = train(*RUN, *MODEL, *SIZES, "data.max_train=100", "data.error=1e-9")
+    done = train(*RUN, *MODEL, *SIZES, "data.train.max_train=100", "data.train.error=1e-9")
     assert not done.status, done.err
     assert "64 loads, " in done.out
-    assert "data.max_train = 100 reached" in done.out
+    assert "data.train.max_train = 100 reached" in done.out
     weights = checkpoints.read(tmp_path / "run/checkpoints/last.ckpt")
-    assert [point[0] for point in weights["OfflineData"]["points"]] == [64, 100]
+    assert [point[0] for point in weights["DataModule"]["points"]] == [64, 100]
     header, *rows = (tmp_path / "run/csv/metrics.csv").read_text().splitlines()
     curve = [row for row in rows if row.split(",")[header.split(",").index("step")] == "100"]
     assert "learning_curve/e_mean" in header
     assert curve, "the step of the learning curve is the number of loads"
     assert run_folder.load(tmp_path / "run").surrogate.net.is_fitted
     assert (tmp_path / "run/evaluation.json").exists()
-    resumed = train("run=run", "ckpt_path=last", "data.max_train=150")
+    resumed = train("run=run", "ckpt_path=last", "data=growing", "data.train.max_train=150")
     assert not resumed.status, resumed.err
     assert "64 loads, " not in resumed.out
     assert "150 loads, " in resumed.out
-    finished = train("run=run", "ckpt_path=last", "data.error=1.0")
+    finished = train("run=run", "ckpt_path=last", "data=growing", "data.train.error=1.0")
     assert not finished.status, finished.err
     assert " loads, " not in finished.out.partition("test loads")[0], "no further fit"
     sessions = (tmp_path / "data/journal.jsonl").read_text().splitlines()
@@ -50,13 +51,12 @@ def test_a_run_fits_until_its_end_and_is_resumed_with_more_loads(train, tmp_path
 TERMINATING = """
 import signal
 
-import lightning as L
+from dpl.training import WorstCasePlots
 
 
-class Terminate(L.Callback):
-    def on_train_epoch_start(self, trainer, module):
-        if trainer.current_epoch == 1:
-            signal.raise_signal(signal.SIGTERM)
+class Terminate(WorstCasePlots):
+    def on_validation_epoch_end(self, trainer, module):
+        signal.raise_signal(signal.SIGTERM)
 """
 
 
@@ -66,16 +66,16 @@ def test_sigterm_ends_a_growing_training_with_143_and_the_command_that_resumes_i
     (tmp_path / "terminating.py").write_text(TERMINATING)
     monkeypatch.syspath_prepend(str(tmp_path))
     stop = "+callbacks.stop={_target_: terminating.Terminate}"
-    ended = train(*RUN, *MODEL, *SIZES, "data.max_train=100", "data.error=1e-9", stop)
+    ended = train(*RUN, *MODEL, *SIZES, "data.train.max_train=100", "data.train.error=1e-9", stop)
     assert ended.status == 143, ended.err
     assert "Traceback" not in ended.err
     assert "run=run ckpt_path=last" in ended.err
     weights = checkpoints.read(tmp_path / "run/checkpoints/last.ckpt")
-    assert weights["OfflineData"]["points"][0][0] == 64
+    assert weights["DataModule"]["points"][0][0] == 64
 
 
 def test_the_set_of_a_growing_run_serves_a_run_of_given_size(train, tmp_path):
-    assert not train(*RUN, *MODEL, *SIZES, "data.max_train=20", "data.error=1e-9").status
+    assert not train(*RUN, *MODEL, *SIZES, *SMALL).status
     again = train("model=unrolled", "data.train=20", "run=other", "logger=none", *MODEL, *SIZES)
     assert not again.status, again.err
     assert "32 of 32 loads not solved again" in again.out
@@ -87,35 +87,32 @@ def test_the_set_of_a_growing_run_serves_a_run_of_given_size(train, tmp_path):
 
 
 def test_the_number_of_loads_of_a_run_is_not_that_of_its_data_set(train, tmp_path):
-    assert not train(*RUN, *MODEL, *SIZES, "data.max_train=20", "data.error=1e-9").status
+    assert not train(*RUN, *MODEL, *SIZES, *SMALL).status
     cfg, surrogate = run_folder.load_run(tmp_path / "run")
     more = OmegaConf.merge(cfg, {"data": {"train": 24}})
     assert len(run_folder.load_data(more, surrogate.scene).samples("train").force) == 24
-    assert run_folder.training_loads(cfg, surrogate.scene) == 20
+    assert run_folder.training_loads(cfg) == 20
     assert len(run_folder.load_data(cfg, surrogate.scene).snapshots().force) == 20
 
 
 def test_models_trained_by_gradient_descent_are_refused(train):
-    refused = train("model=fcnn", "data.train=auto")
+    refused = train("model=fcnn", "data=growing")
     assert refused.status == 2
-    assert refused.err.startswith("error: data.train = auto needs a model that is fitted")
+    assert refused.err.startswith("error: data=growing needs a model that is fitted")
     assert refused.err.count("\n") == 1
 
 
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ("data.train=many", "data.train = 'many' must be a whole number or one of auto"),
-        ("data.error=0", "data: error = 0 must be above 0"),
-        ("data.minutes=-1", "data: minutes = -1 must be above 0 [min], or null"),
-        ("data.max_train=0", "data: max_train = 0 must lie between 1 and 10,000,000"),
-        ("+trainer.limit_val_batches=0", "data.train = auto needs held-out errors"),
-        ("trainer.devices=2", "data.train = auto needs one process; set trainer.devices=1"),
+        ("data.train=auto", "data.train = 'auto' must be a whole number or a call that returns a"),
+        ("data.train.error=0", "data: error = 0 must be above 0"),
+        ("data.train.minutes=-1", "data: minutes = -1 must be above 0 [min], or null"),
+        ("data.train.max_train=0", "data: max_train = 0 must lie between 1 and 10,000,000"),
     ],
 )
 def test_values_are_refused_in_one_line_before_any_solve(train, tmp_path, option, message):
-    cpu = ["trainer.accelerator=cpu"] if "devices" in option else []
-    refused = train("model=unrolled", "data.train=auto", "data.folder=data", option, *cpu)
+    refused = train("model=unrolled", "data=growing", "data.folder=data", option)
     assert refused.status == 2
     assert message in refused.err
     assert not (tmp_path / "data").exists()

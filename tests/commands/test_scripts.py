@@ -228,7 +228,12 @@ def test_a_data_set_of_another_scene_is_refused_with_both_fingerprints(
 
 def online(tiny_training, *more):
     kept = [o for o in tiny_training if "data.train" not in o and "data.workers" not in o]
-    small = ["data.workers=2", "data.batches=4", "data.new_per_round=4", "data.reuse=8"]
+    small = [
+        "data.workers=2",
+        "data.train.batches=4",
+        "data.train.new_per_round=4",
+        "data.train.reuse=8",
+    ]
     return ["data=online", *kept, *small, *more]
 
 

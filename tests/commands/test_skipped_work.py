@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dpl.data import OfflineData, OnlineData
+from dpl.data import DataModule
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.fem import Load, Problem, solve
 from dpl.fem.assembly import element_loops
@@ -227,7 +227,7 @@ def test_inputs_and_outputs_are_only_where_something_happens(scene):
 
 
 def test_a_plan_computes_no_sample(scene, tmp_path, calls):
-    module = OfflineData(scene, folder=str(tmp_path / "none"), workers=0)
+    module = DataModule(scene, folder=str(tmp_path / "none"), workers=0)
     scene.loads.eigenmodes  # noqa: B018
     calls.clear()
     assert scene.skipped_work()
@@ -241,13 +241,13 @@ def test_one_data_set_serves_every_size_and_modulus(make_scene, scene, folder, d
     """What the plan says of it: another size and range, and nothing is missing."""
     other = make_scene(size=(1.0, 0.25, 0.25), young=[1e6, 2e11])
     assert other.fingerprint == scene.fingerprint
-    module = OfflineData(other, folder=str(folder), train=12, val=4, test=4, workers=0)
+    module = DataModule(other, folder=str(folder), train=12, val=4, test=4, workers=0)
     assert module.skipped_work()[1] == "20 of 20 loads not solved again: they are there"
 
 
 def test_images_under_symmetries_are_not_solved(scene, folder, data, calls, monkeypatch):
     sizes = {"train": 12, "val": 4, "test": 4, "workers": 0}
-    module = OfflineData(scene, folder=str(folder), symmetry=True, **sizes)
+    module = DataModule(scene, folder=str(folder), symmetry=True, **sizes)
     line = module.skipped_work()[-1]
     count = int(line.split()[0])
     images = f"{count} samples of each load solved, in gradient descent only"
@@ -258,19 +258,4 @@ def test_images_under_symmetries_are_not_solved(scene, folder, data, calls, monk
     module.prepare_data()
     calls.clear()
     assert sum(len(batch.force) for batch in module.train_dataloader()) == 12 * count
-    assert calls == {}
-
-
-def test_a_stream_solves_nothing_that_the_data_set_has(scene, tmp_path, calls):
-    """With cache=true."""
-    options = {"val": 1, "test": 1, "workers": 0, "batch_size": 4, "batches": 2, "new_per_round": 4}
-    made = OfflineData(scene, folder=str(tmp_path / "d"), train=8, val=1, test=1, workers=0)
-    made.prepare_data()
-    module = OnlineData(scene, folder=str(tmp_path / "d"), reuse=1, cache=True, **options)
-    assert "8 loads of the stream not solved again: they are there" in module.skipped_work()
-    module.prepare_data()
-    threads = torch.get_num_threads()
-    calls.clear()
-    assert sum(len(batch.force) for batch in module.train_dataloader()) == 8
-    torch.set_num_threads(threads)
     assert calls == {}

@@ -8,7 +8,7 @@ import torch
 
 from dpl import ConfigError
 from dpl.config import build
-from dpl.data import OfflineData
+from dpl.data import DataModule
 from dpl.fem import DirichletBC, Plane, Problem, RobinBC, Traction, box
 from dpl.fem.units import Units
 from dpl.inference import Simulator
@@ -77,7 +77,7 @@ def test_only_ratios_to_the_modulus_identify_a_scene(scene_of):
 @pytest.mark.parametrize("line", [PULL, BED, MOVED, None])
 def test_a_plan_says_that_a_data_set_depends_on_boundary_values(scene_of, tmp_path, line):
     scene = scene_of(*BAR, *([line] if line else []))
-    data = OfflineData(scene, folder=str(tmp_path / "none"), workers=0)
+    data = DataModule(scene, folder=str(tmp_path / "none"), workers=0)
     assert ("boundary values over E and L" in data.skipped_work()[0]) == (line is not None)
 
 

@@ -28,7 +28,7 @@ STORED = {  # options of train.py
         "loads.region={_target_:dpl.fem.Tag,name:a}",
     ],
     "finger": ["experiment=finger"],
-    "growing": ["mesh=propeller", "data.train=auto", "model=unrolled"],
+    "growing": ["mesh=propeller", "data=growing", "model=unrolled"],
 }
 FOREIGN = "somebody_elses.record"
 CALLS = [  # each calls or imports a module outside the package

@@ -11,7 +11,6 @@ import multiprocessing
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -176,17 +175,6 @@ def test_workers_in_a_solve_end_with_a_killed_parent(start, members, slow, tmp_p
 
 
 @pytest.mark.slow
-def test_starting_workers_end_with_a_killed_parent(start, members, slow, tmp_path):
-    """See tests/system/test_processes.py for workers that are stopped while they import."""
-    process = start("generate", *slow(pause=-1), cwd=tmp_path)
-    assert waited_for(lambda: workers_of(members, process.pid))
-    process.kill()
-    process.wait()
-    assert gone(members, process.pid)
-    assert not begun(tmp_path)
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_twenty_killed_runs_and_a_resume_make_the_bytes_of_one_run(
     start, members, script, slow, tmp_path
@@ -294,21 +282,6 @@ def test_an_interrupt_during_the_start_of_workers_prints_no_traceback(
     assert "Traceback" not in err
 
 
-@pytest.mark.slow
-@pytest.mark.xfail(reason="a signal that comes while Python itself ends prints its traceback")
-def test_repeated_interrupts_print_no_traceback(start, members, slow, tmp_path):
-    process = start("generate", *slow(pause=-1), cwd=tmp_path)
-    assert waited_for(lambda: begun(tmp_path) == 2)
-    for _ in range(6):
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGINT)
-        time.sleep(0.03)
-    status, _, err = finish(process)
-    assert status == 130, err[-2000:]
-    assert "Traceback" not in err
-    assert gone(members, process.pid)
-
-
 # ------------------------------------------------------------------ several writers
 
 
@@ -340,30 +313,11 @@ def test_two_parts_made_in_parallel_have_the_bytes_of_a_set_made_at_once(
     assert "0 flaws found" in sound.out
 
 
-@pytest.mark.slow
-def test_a_second_process_is_refused_while_the_first_one_lives(
-    start, members, script, slow, tmp_path
-):
-    first = start("generate", *slow(gate="never", train=100), cwd=tmp_path)
-    assert waited_for(lambda: begun(tmp_path) == 2)
-    for part in ([], ["shard=1", "shards=2"], ["action=repair"]):
-        second = script("generate", *slow(workers=0, train=100), *part, cwd=tmp_path)
-        assert second.status == 2
-        assert f"process {first.pid} on {socket.gethostname()}" in second.err
-        assert second.err.count("\n") == 1
-    assert first.poll() is None
-    first.kill()
-    first.wait()
-    made(script, slow(train=100), tmp_path)
-    assert len((tmp_path / "d/manifest.jsonl").read_text().splitlines()) == 4
-
-
 # ------------------------------------------------------------------ a full disk
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("blocks", [4, 16])
+@pytest.mark.parametrize(("workers", "blocks"), [(0, 4), (2, 16)])
 def test_a_limit_of_the_file_size_ends_with_one_line_and_a_resume_makes_the_same_bytes(
     limited, script, slow, tmp_path, workers, blocks
 ):

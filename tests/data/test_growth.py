@@ -5,9 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from lightning.pytorch.trainer.states import TrainerFn
 
-from dpl.data import DataSet, OfflineData, background, growth
+from dpl.data import DataModule, DataSet, Growing, background, growing
 from dpl.data.background import BackgroundSolver
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.data.storage import store as store_module
@@ -15,15 +14,14 @@ from dpl.data.storage.store import Store
 from dpl.system.files import DataSetError, exclusive_lock
 
 BLOCK = 4
-FITTING = SimpleNamespace(state=SimpleNamespace(fn=TrainerFn.FITTING), global_rank=0, world_size=1)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Fits begin with four loads; the number of threads, which growth changes, is restored."""
-    for module in (growth, store_module):
+    for module in (growing, store_module):
         monkeypatch.setattr(module, "SHARD_SIZE", BLOCK)
-    monkeypatch.setattr(growth, "HELD_OUT", 2)
+    monkeypatch.setattr(growing, "HELD_OUT", 2)
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
@@ -31,15 +29,15 @@ def small(monkeypatch):
 
 @pytest.fixture
 def module(scene, tmp_path):
-    """Return a function that builds growing data modules of one folder, as in a training."""
+    """Return a function that builds growing data modules of one folder."""
     made = []
 
     def module(**options):
-        options = {"train": "auto", "val": 6, "test": 2, "workers": 0, **options}
-        made.append(OfflineData(scene, folder=str(tmp_path / "d"), **options))
-        made[-1].trainer = FITTING
-        made[-1].prepare_data()
-        return made[-1]
+        sizes = {"val": 6, "test": 2, "workers": 0}
+        data = DataModule(scene, folder=str(tmp_path / "d"), train=Growing(**options), **sizes)
+        data.fits = data.source.fits(data.dataset)
+        made.append(data)
+        return data
 
     yield module
     for one in made:
@@ -47,67 +45,67 @@ def module(scene, tmp_path):
 
 
 def errors(median):
-    return {"rel_L2_median": median, "rel_L2_worst": 2 * median, "e_mean": median}
+    return {"median": median, "worst": 2 * median, "e_mean": median}
 
 
 def step(data, median):
     """Grow the training set and record an error; return the number of training loads."""
-    data.train_dataloader()
-    data.growth.record(data.sizes["train"], errors(median))
+    data.sizes |= next(data.fits)
+    data.source.record(data.sizes["train"], errors(median))
     return data.sizes["train"]
 
 
 def test_each_fit_has_more_loads_of_the_data_set_of_its_seed(module, scene, tmp_path):
     data = module(max_train=16)
-    found = [step(data, error) for error in (1.0, 0.9, 0.8)]
-    assert found == [4, 8, 12]
-    whole = OfflineData(scene, folder=str(tmp_path / "e"), train=12, val=6, test=1, workers=0)
+    found = [(step(data, error), len(data.samples("val").force)) for error in (1.0, 0.9, 0.8)]
+    assert found == [(4, 2), (8, 4), (12, 6)]
+    whole = DataModule(scene, folder=str(tmp_path / "e"), train=12, val=6, test=1, workers=0)
     whole.prepare_data()
     assert torch.equal(data.samples("train").force, whole.samples("train").force)
     assert torch.equal(data.samples("train").displacement, whole.samples("train").displacement)
     assert torch.equal(data.samples("val").force, whole.samples("val").force[:6])
 
 
-def test_held_out_loads_grow_with_the_training_loads(module):
-    data = module()
-    sizes = [(step(data, error), len(data.samples("val").force)) for error in (1.0, 0.9, 0.8)]
-    assert sizes == [(4, 2), (8, 4), (12, 6)]
-    assert data.growth.held_out(1000) == 6
-
-
-def test_it_ends_at_the_error_with_all_loads_of_validation_and_test(module):
-    data = module(error=0.5)
+@pytest.mark.parametrize("limit", [{"error": 0.5}, {"max_train": 6}])
+def test_it_ends_with_all_loads_of_validation_and_test(module, limit):
+    data = module(**limit)
     step(data, 1.0)
-    assert not data.growth.is_finished
     step(data, 0.4)
-    assert data.growth.is_finished
+    assert next(data.fits, None) is None
     data.teardown("fit")
+    assert data.source.count(data.store) == limit.get("max_train", 8)
     assert not data.store.missing("val", 6)
     assert not data.store.missing("test", 2)
 
 
-def test_it_ends_at_the_largest_number_of_loads(module):
-    data = module(max_train=6)
-    assert [step(data, error) for error in (1.0, 0.9)] == [4, 6]
-    assert data.growth.is_finished
+@pytest.mark.parametrize(("error", "sizes"), [(1e-3, [8]), (0.5, [])])
+def test_a_growth_is_continued_from_its_state(module, error, sizes):
+    before = module(max_train=8)
+    step(before, 0.4)
+    before.teardown("fit")
+    after = module(max_train=8, error=error)
+    after.load_state_dict(before.state_dict())
+    assert after.source.points == before.source.points
+    for expected in sizes:
+        assert step(after, 0.4) == expected
+    assert next(after.fits, None) is None
 
 
 def test_it_ends_before_a_fit_that_would_exceed_the_time(module, monkeypatch):
     clock = SimpleNamespace(now=0.0)
-    monkeypatch.setattr(growth.time, "monotonic", lambda: clock.now)
+    monkeypatch.setattr(growing.time, "monotonic", lambda: clock.now)
     data = module(minutes=1.0)
-    data.train_dataloader()
+    next(data.fits)
     clock.now = 20.0
-    assert "data.minutes" not in data.growth.record(4, errors(1.0))
-    assert not data.growth.is_finished
-    data.train_dataloader()
+    assert "minutes" not in data.source.record(4, errors(1.0))
+    next(data.fits)
     clock.now = 45.0
-    assert "data.minutes = 1 reached" in data.growth.record(8, errors(1.0))
-    assert data.growth.is_finished
+    assert "data.train.minutes = 1 reached" in data.source.record(8, errors(1.0))
+    assert next(data.fits, None) is None
 
 
 def test_it_ends_after_two_fits_without_gain(module):
-    growth = module(max_train=1000).growth
+    growth = module(max_train=1000).source
     for loads, median in ((64, 0.5), (128, 0.4), (192, 0.39)):
         assert "without gain" not in growth.record(loads, errors(median))
     assert not growth.is_finished
@@ -134,35 +132,12 @@ def test_loads_that_are_there_are_not_solved_again(module, monkeypatch):
     assert step(second, 0.9) == 8
 
 
-def test_loads_that_are_there_speed_up_the_growth(module, scene, tmp_path):
-    DataSet(scene, str(tmp_path / "d"), train=40, val=6, test=2, workers=0).fill()
-    data = module()
-    assert [step(data, error) for error in (1.0, 1.0, 1.0)] == [4, 16, 40]
-
-
-def test_no_more_loads_than_predicted_are_taken(module, scene, tmp_path):
+def test_loads_that_are_there_are_taken_but_no_more_than_predicted(module, scene, tmp_path):
     DataSet(scene, str(tmp_path / "d"), train=40, val=6, test=2, workers=0).fill()
     data = module(error=1.0 / 24.5)
-    assert [step(data, 1 / 4), step(data, 1 / 16), data.growth.next_sizes()["train"]] == [4, 16, 28]
-
-
-def test_a_growth_is_continued_from_its_state(module):
-    before = module()
-    step(before, 1.0)
-    before.teardown("fit")
-    after = module()
-    after.load_state_dict(before.state_dict())
-    assert after.growth.points == before.growth.points
-    assert step(after, 0.9) == 8
-
-
-def test_a_finished_growth_is_not_continued(module):
-    before = module(error=0.5)
-    step(before, 0.4)
-    after = module(error=0.5)
-    after.load_state_dict(before.state_dict())
-    after.train_dataloader()
-    assert after.sizes["train"] == 4
+    assert [step(data, 1 / 4), step(data, 1 / 16), next(data.fits)["train"]] == [4, 16, 28]
+    fast = module()
+    assert [step(fast, error) for error in (1.0, 1.0, 1.0)] == [4, 16, 40]
 
 
 def test_a_set_that_grew_is_read_as_a_whole_by_later_commands(module):
@@ -170,18 +145,9 @@ def test_a_set_that_grew_is_read_as_a_whole_by_later_commands(module):
     step(data, 1.0)
     step(data, 1.0)
     data.teardown("fit")
-    later = OfflineData(data.scene, folder=str(data.store.folder), **{"train": "auto"}, val=6)
-    later.dataset.fill()
+    later = module(max_train=8)
     later.prepare_data()
     assert len(later.snapshots().force) == 8
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"error": 0}, {"error": float("nan")}, {"minutes": 0.0}, {"max_train": 0}]
-)
-def test_numbers_out_of_range_are_refused(scene, wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        OfflineData(scene, train="auto", **wrong)
 
 
 # ------------------------------------------------------------------ in the background

@@ -11,7 +11,7 @@ from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.storage import store as store_module
 from dpl.data.storage.manifest import entry_of_load, merge_entries
 from dpl.data.storage.pending import DIGEST_SIZE, PendingLoads
-from dpl.data.storage.shard import concatenate, decode_shard, encode_load, select, to_dense
+from dpl.data.storage.shard import concatenate, decode_shard, encode_load, to_dense
 from dpl.data.storage.store import runs
 
 SHAPE, DIMENSION = (4, 3), 2
@@ -60,9 +60,10 @@ def line(*loads):
 
 def test_a_decoded_load_equals_the_encoded_one():
     loads = [solved(5), solved(6, nodes=(0, 1, 2, 3)), solved(7, nodes=())]
-    shard = decode_shard(content(*loads), SHAPE, DIMENSION)
     for one in loads:
-        assert same(select(shard, one.job.number), one)
+        assert same(decode_shard(content(one), SHAPE, DIMENSION), one)
+    shard = decode_shard(content(*loads), SHAPE, DIMENSION)
+    assert np.array_equal(to_dense(shard, SHAPE), np.stack([one.force for one in loads]))
     assert shard["parameters"].shape == (3, 0)
     assert shard["iterations"].tolist() == [8, 9, 10]
 
@@ -71,8 +72,7 @@ def test_a_rejected_load_has_no_rows_and_a_reason_in_the_manifest():
     loads = [solved(5), solved(6, accepted=False), solved(7)]
     shard = decode_shard(content(*loads), SHAPE, DIMENSION)
     assert shard["index"].tolist() == [5, 7]
-    assert not any(len(column) for column in select(shard, 6).values())
-    assert same(select(shard, 7), loads[2])
+    assert np.array_equal(to_dense(shard, SHAPE)[1], loads[2].force)
     rejected = {"index": 6, "reason": "diverged", "load_factor": 1.0}
     assert line(*loads)["rejected"] == [rejected]
 
@@ -92,7 +92,7 @@ def test_a_pending_load_is_a_shard_of_one_load_with_its_line_of_the_manifest(tmp
     pending = PendingLoads(tmp_path / "pending", {"val": (7, 1)}, lambda points: points[:, 2:])
     for one in (solved(3), solved(4, nodes=())):
         entry, columns = pending.read(pending.write(one))
-        assert same(select(columns, one.job.number), one)
+        assert same(columns, one)
         assert entry == line(one)
         assert save(columns) == content(one)
     rejected = solved(5, accepted=False)
@@ -174,19 +174,16 @@ def test_columns_of_wrong_shape_or_type_are_refused(name):
 
 
 @pytest.mark.parametrize(
-    ("indices", "whole", "expected"),
+    ("indices", "expected"),
     [
-        ([], False, []),
-        ([0, 1, 2, 3, 4], False, [[0, 1, 2, 3], [4]]),
-        ([0, 1, 2, 3, 4], True, [[0, 1, 2, 3]]),
-        ([1, 2, 3, 4], True, []),
-        ([2, 3, 5, 8, 9, 10, 11, 12], False, [[2, 3], [5], [8, 9, 10, 11], [12]]),
-        ([3, 4, 5, 6, 7], True, [[4, 5, 6, 7]]),
+        ([], []),
+        ([0, 1, 2, 3, 4], [[0, 1, 2, 3], [4]]),
+        ([2, 3, 5, 8, 9, 10, 11, 12], [[2, 3], [5], [8, 9, 10, 11], [12]]),
     ],
 )
-def test_a_file_holds_consecutive_loads_of_one_block(monkeypatch, indices, whole, expected):
+def test_a_file_holds_consecutive_loads_of_one_block(monkeypatch, indices, expected):
     monkeypatch.setattr(store_module, "SHARD_SIZE", 4)
-    assert list(runs(indices, whole=whole)) == expected
+    assert list(runs(indices)) == expected
 
 
 def test_writers_take_blocks_of_loads_in_turn(scene, tmp_path, monkeypatch):

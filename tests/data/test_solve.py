@@ -64,6 +64,9 @@ def test_residual_and_volume_ratio_belong_to_the_returned_displacement(scene, jo
         force, displacement = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
         ratio = scene.problem.relative_residual(displacement[None], force[None])
         assert one.job == job
+        assert np.array_equal(one.force, scene.loads.sample(SEED, [job.number]).force[0])
+        assert np.array_equal(one.point, scene.loads.points(SEED, [job.number])[0])
+        assert one.amplitude == pytest.approx(float(force.norm()) / scene.loads.largest_force)
         assert one.accepted
         assert float(ratio) == pytest.approx(one.residual, rel=1e-6, abs=1e-14)
         assert one.residual < scene.solver.tol
@@ -72,22 +75,6 @@ def test_residual_and_volume_ratio_belong_to_the_returned_displacement(scene, jo
         assert one.iterations > 0
         assert one.seconds > 0
         assert one.reason == ""
-
-
-def test_a_solved_load_holds_force_point_and_amplitude(scene, jobs):
-    one = solve_load(scene, jobs[2])
-    load = scene.loads.sample(SEED, [2])
-    assert torch.equal(torch.from_numpy(one.force), load.force[0])
-    assert torch.equal(torch.from_numpy(one.point), scene.loads.points(SEED, [2])[0])
-    assert one.amplitude == pytest.approx(float(load.force.norm()) / scene.loads.largest_force)
-    assert 0 < one.amplitude <= 1
-
-
-def test_a_given_point_replaces_the_point_of_the_stream(scene, jobs):
-    point = scene.loads.points(SEED, [7])[0]
-    given, drawn = solve_load(scene, jobs[0], point=point), solve_load(scene, jobs[7])
-    assert given.job == jobs[0]
-    assert content(given) | {"job": jobs[7]} == content(drawn)
 
 
 def test_a_load_without_a_solution_is_rejected_with_the_fraction_that_has_one(hard):

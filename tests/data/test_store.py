@@ -6,11 +6,9 @@ import multiprocessing
 import os
 import shutil
 import subprocess
-import time
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save
@@ -19,9 +17,8 @@ from dpl import DataSetError
 from dpl.data import DataSet, Store, dataset
 from dpl.data.solving import worker_pool
 from dpl.data.solving.solve import LoadKey, failed_load, solve_load
-from dpl.data.solving.worker_pool import GracefulShutdown
 from dpl.data.storage import store as store_module
-from dpl.data.storage.integrity import MACHINE_FAILURES, repair, verify
+from dpl.data.storage.integrity import repair, verify
 from dpl.data.storage.manifest import shard_name
 from dpl.data.storage.pending import PendingLoads
 from dpl.data.storage.shard import to_dense, to_sparse
@@ -91,10 +88,6 @@ def content(store):
     }
 
 
-def hidden(store):
-    return sorted(path.name for path in store.folder.rglob(".*.part"))
-
-
 def same(one, other):
     return all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
@@ -141,13 +134,6 @@ def test_stored_samples_are_the_loads_of_their_stream_in_order(data, scene):
         assert torch.equal(data.store.load(split, size).young, drawn.young)
 
 
-def test_train_val_and_test_share_no_load(data):
-    forces = torch.cat([data.store.load(split, size).force for split, size in SIZES.items()])
-    distance = torch.cdist(forces.flatten(1), forces.flatten(1))
-    distance.fill_diagonal_(1.0)
-    assert distance.min() > 1e-9
-
-
 def test_the_first_samples_do_not_depend_on_how_many_there_are(data):
     assert same(data.store.load("train", 5), [c[:5] for c in data.store.load("train", 12)])
 
@@ -166,17 +152,6 @@ def test_the_data_set_carries_fingerprint_seed_and_versions(data, scene):
     assert card["versions"]["torch"] == torch.__version__
 
 
-def test_the_reader_gives_each_load_as_it_was_solved(data, scene):
-    read = data.store.reader("val")
-    for number in (3, 0, 1):
-        one, again = read(number), solve_load(scene, LoadKey(data.store.stream("val"), number))
-        assert one["index"].tolist() == [number]
-        assert np.array_equal(to_dense(one, scene.problem.shape)[0], again.force)
-        for name in ("point", "displacement", "residual", "volume_ratio", "iterations"):
-            assert np.array_equal(one[name][0], getattr(again, name)), name
-    assert read(4) is None
-
-
 def test_rejected_loads_are_recorded_with_reason_and_load_factor(hard, tmp_path):
     store = Store(tmp_path / "d", hard, 0)
     fill(store, {"train": range(6)})
@@ -187,7 +162,6 @@ def test_rejected_loads_are_recorded_with_reason_and_load_factor(hard, tmp_path)
     for one in line["rejected"]:
         assert one["reason"]
         assert 0 <= one["load_factor"] < 1
-        assert not len(store.reader("train")(one["index"])["index"])
     rejected = {one["index"] for one in line["rejected"]}
     shard = load_file(store.folder / line["file"])
     assert set(shard["index"].tolist()) == set(range(6)) - rejected
@@ -207,7 +181,6 @@ def test_a_shard_may_hold_rejected_loads_only(scene, fresh, monkeypatch):
     fill(fresh, {"train": range(3)})
     assert fresh.missing("train", 4) == [3]
     assert flaws(fresh) == {}
-    assert not len(fresh.reader("train")(1)["index"])
     assert {one["reason"] for one in lines(fresh)[0]["rejected"]} == {"never"}
     with pytest.raises(DataSetError, match="no train samples"):
         fresh.load("train", 3)
@@ -283,7 +256,7 @@ def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fr
     assert content(fresh) == content(data.store)
 
 
-@pytest.mark.parametrize("size", [1, 5, 1000])
+@pytest.mark.parametrize("size", [1, 5])
 def test_the_samples_do_not_depend_on_the_size_of_shards(data, fresh, monkeypatch, size):
     monkeypatch.setattr(store_module, "SHARD_SIZE", size)
     fill(fresh, WANTED)
@@ -293,82 +266,6 @@ def test_the_samples_do_not_depend_on_the_size_of_shards(data, fresh, monkeypatc
     assert flaws(fresh) == {}
 
 
-@pytest.mark.parametrize("after", [1, 4, 7, 12, 14, 19, 20])
-def test_a_run_interrupted_anywhere_and_resumed_makes_the_same_bytes(
-    scene, tmp_path, monkeypatch, solved, after
-):
-    monkeypatch.setattr(store_module, "SHARD_SIZE", 4)
-    whole, store = Store(tmp_path / "whole", scene, 0), Store(tmp_path / "d", scene, 0)
-    fill(whole)
-    solved.clear()
-    running = writer(store).solve(WANTED.items())
-    for _ in range(after):
-        next(running)
-    running.close()
-    assert sum(len(store.missing(*split)) for split in SIZES.items()) >= 20 - after
-    assert fill(store) == 20 - after
-    assert len(set(solved)) == len(solved) == 20, "no load is solved twice"
-    assert content(store) == content(whole)
-    assert not (store.folder / "pending").exists()
-    assert fill(store) == 0
-
-
-def test_interrupted_at_every_load_the_bytes_are_the_same(data, fresh, solved):
-    while running := writer(fresh).solve(
-        [(split, fresh.missing(split, size)) for split, size in SIZES.items()]
-    ):
-        if next(running, None) is None:
-            break
-        running.close()
-    assert len(solved) == 20
-    assert content(fresh) == content(data.store)
-
-
-def test_pending_files_whose_shard_exists_are_removed(data, fresh, monkeypatch):
-    """The run was killed between writing a shard and removing its pending files."""
-    monkeypatch.setattr(Path, "unlink", lambda *_, **__: (_ for _ in ()).throw(SystemExit(9)))
-    with pytest.raises(SystemExit):
-        fill(fresh, {"train": range(12)})
-    monkeypatch.undo()
-    assert fresh.missing("train", 12) == []
-    fill(fresh)
-    assert content(fresh) == content(data.store)
-    assert not (fresh.folder / "pending").exists()
-
-
-def test_a_damaged_pending_load_is_solved_again(data, fresh, solved):
-    running = writer(fresh).solve(WANTED.items())
-    for _ in range(5):
-        next(running)
-    running.close()
-    files = sorted((fresh.folder / "pending").iterdir())
-    assert len(files) == 5
-    harmed = bytearray(files[2].read_bytes())
-    harmed[-5] ^= 1
-    files[2].write_bytes(harmed)
-    files[3].write_bytes(files[3].read_bytes()[:-8])
-    files[4].write_bytes(b"")  # not synced, the machine crashed
-    solved.clear()
-    fill(fresh, WANTED)
-    assert solved[:3] == [(0, 0, 2), (0, 0, 3), (0, 0, 4)]
-    assert content(fresh) == content(data.store)
-
-
-def test_partial_files_of_killed_processes_are_removed(data, fresh):
-    running = writer(fresh).solve(WANTED.items())
-    next(running)
-    running.close()
-    long_ago = time.time() - 3600
-    for path in (fresh.folder / ".train-000000.safetensors.123.part",
-                 fresh.folder / "pending" / ".train-000001.load.123.part"):  # fmt: skip
-        path.write_bytes(b"half of it")
-        os.utime(path, (long_ago, long_ago))
-    fill(fresh)
-    assert hidden(fresh) == []
-    assert not (fresh.folder / "pending").exists()
-    assert content(fresh) == content(data.store)
-
-
 def test_nothing_in_the_manifest_depends_on_a_clock(copy):
     known = {"file", "sha256", "split", "first", "tried", "accepted", "iterations", "amplitudes",
              "rejected"}  # fmt: skip
@@ -376,13 +273,6 @@ def test_nothing_in_the_manifest_depends_on_a_clock(copy):
 
 
 # ------------------------------------------------------------------ growing
-
-
-def test_a_matching_data_set_is_reused_and_nothing_is_solved(copy, solved):
-    before = content(copy)
-    assert fill(copy) == 0
-    assert solved == []
-    assert content(copy) == before
 
 
 def test_growing_solves_only_the_new_loads_and_gives_the_same_samples(data, fresh, solved):
@@ -408,15 +298,6 @@ def test_shards_begin_at_multiples_of_their_size(fresh, monkeypatch):
     ]  # fmt: skip
 
 
-def test_loads_that_another_process_has_solved_are_not_solved_again(data, fresh, solved):
-    fill(fresh, {"train": range(5)})  # what the other one did after this one had looked
-    solved.clear()
-    fill(fresh, WANTED)
-    assert len(solved) == 15
-    assert flaws(fresh) == {}
-    assert fresh.digest("train", 12) == data.store.digest("train", 12)
-
-
 def test_a_load_that_two_writers_have_solved_is_read_once(data, copy):
     """Parts of different divisions were copied into one folder."""
     (copy.folder / "manifest-0-of-2.jsonl").write_bytes(
@@ -427,34 +308,6 @@ def test_a_load_that_two_writers_have_solved_is_read_once(data, copy):
 
 
 # ------------------------------------------------------------------ parts
-
-
-def test_parts_made_by_several_writers_are_the_same_samples(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(store_module, "SHARD_SIZE", 2)
-    whole, store = Store(tmp_path / "whole", scene, 0), Store(tmp_path / "d", scene, 0)
-    fill(whole)
-    running = []
-    for part in range(2):  # at the same time, a load each in turn
-        mine = {split: store.missing(split, size, part, 2) for split, size in SIZES.items()}
-        running.append(writer(store, part, 2).solve(mine.items()))
-    found = []
-    while running:
-        for one in list(running):
-            if (solved := next(one, None)) is None:
-                running.remove(one)
-            else:
-                found.append(solved.job)
-    assert len(set(found)) == len(found) == 20
-    assert not (store.folder / "manifest.jsonl").exists()
-    assert {line["first"] % 4 for line in lines(store, "manifest-0-of-2.jsonl")} == {0}
-    assert {line["first"] % 4 for line in lines(store, "manifest-1-of-2.jsonl")} == {2}
-    for split, size in SIZES.items():
-        assert store.digest(split, size) == whole.digest(split, size)
-        assert store.missing(split, size) == []
-    shards = [{k: v for k, v in content(s).items() if "manifest" not in k} for s in (store, whole)]
-    assert shards[0] == shards[1]
-    assert fill(store) == 0
-    assert flaws(store) == {}
 
 
 def test_a_second_writer_of_the_whole_or_of_the_same_part_is_refused(fresh):
@@ -480,17 +333,6 @@ def test_a_pending_file_that_another_process_removes_is_ignored(data, fresh):
 
 
 # ------------------------------------------------------------------ interruption
-
-
-def test_an_interrupted_run_keeps_solved_loads(fresh):
-    stop = GracefulShutdown()
-    found = 0
-    for _ in writer(fresh).solve(WANTED.items(), stop):
-        found += 1
-        stop._requested = found == 3
-    assert found == 3
-    assert len(list((fresh.folder / "pending").iterdir())) == 3
-    assert not list(fresh.folder.glob("train*"))
 
 
 def test_an_error_in_writing_ends_the_workers(fresh, monkeypatch):
@@ -556,18 +398,11 @@ def test_a_folder_that_is_no_data_set_is_refused_and_not_changed(scene, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-def test_an_unknown_format_is_refused(copy):
-    card = copy.folder / "scene.json"
-    card.write_text(json.dumps({**json.loads(card.read_text()), "format": 99}))
-    with pytest.raises(DataSetError, match="format 99"):
-        copy.shards()
-
-
 @pytest.mark.parametrize(
     "harm",
     [
         *("", "{", "[]", "null", "\0\0\0"),
-        '{"format": 3}',
+        '{"format": 99}',
         '{"format": 3, "fingerprint": 3}',
     ],
 )
@@ -600,14 +435,6 @@ def test_a_folder_that_is_a_file_is_refused_by_its_key(scene, tmp_path, kind):
     path.touch()
     with pytest.raises(DataSetError, match=r"^data\.folder = .* must be a folder"):
         Store(path, scene, 0).shards()
-
-
-@pytest.mark.parametrize("harm", ["{}", '{"split": "train"}', '{"first": 0, "tried": 3}'])
-def test_a_line_of_the_manifest_with_missing_keys_is_ignored(copy, harm):
-    with (copy.folder / "manifest.jsonl").open("a") as file:
-        file.write(harm + "\n")
-    assert copy.missing("train", 13) == [12]
-    assert len(copy.load("train", 12).force) == 12
 
 
 def test_an_empty_split_is_refused(copy):
@@ -682,40 +509,15 @@ def another_name(shard):
     shard["index"] += 100
 
 
-def a_load_less(shard):
-    shard["index"] = shard["index"][1:].clone()
-
-
-def another_shape(shard):
-    shard["displacement"] = shard["displacement"][:, :-1].contiguous()
-
-
 def another_point(shard):
     shard["point"][:, -1] = 0.25
-
-
-def nodes_that_are_not_there(shard):
-    shard["node"][0] = 10_000
-
-
-def no_forces(shard):
-    del shard["nodal_force"]
-
-
-def no_safetensors(shard):
-    return b"nothing of the kind"
-
-
-def cut(shard):
-    return save(shard)[:-8]
 
 
 @pytest.mark.parametrize(
     "change",
     [
         *(out_of_balance, inverted, not_a_number, another_load, another_order, another_name),
-        a_load_less,
-        *(another_shape, another_point, nodes_that_are_not_there, no_forces, no_safetensors, cut),
+        another_point,
     ],
 )
 def test_verify_finds_damaged_shards_whose_digest_is_right(data, copy, change):
@@ -731,49 +533,7 @@ def test_verify_finds_damaged_shards_whose_digest_is_right(data, copy, change):
     assert after == before
 
 
-def test_a_shard_of_another_scene_is_found(copy, make_scene, tmp_path):
-    other = Store(tmp_path / "other", make_scene(deflection=0.2), 0)
-    fill(other)
-    name = lines(copy)[0]["file"]
-    rewrite(copy, lambda shard: (other.folder / name).read_bytes())
-    assert list(flaws(copy)) == [name]
-
-
-def as_float32(shard):
-    shard["displacement"] = shard["displacement"].float()
-
-
-def forces_on_less_than_no_node(shard):
-    shard["n_loaded_nodes"] = shard["n_loaded_nodes"].flip(0).contiguous()
-    shard["n_loaded_nodes"][0] += shard["n_loaded_nodes"][1] + 1
-    shard["n_loaded_nodes"][1] = -1
-
-
-def endless_force(shard):
-    shard["nodal_force"][0, 0] = float("inf")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [as_float32, forces_on_less_than_no_node, endless_force, not_a_number, a_load_less],
-)
-def test_invalid_numbers_are_refused_even_if_the_digest_is_right(copy, change):
-    name = rewrite(copy, change)
-    with pytest.raises(DataSetError, match=rf"{name} .*action=repair"):
-        copy.load("train", 12)
-
-
-IMPOSSIBLE = [
-    *({"split": "vrain"}, {"split": None}, {"file": 3}, {"file": "x" * 999}, {"file": "a\nb"}),
-    *({"file": "/dev/zero"}, {"first": -1}, {"first": "0"}, {"first": True}, {"tried": 10**12}),
-    *({"tried": 13}, {"accepted": 11}, {"iterations": None}, {"amplitudes": [1.0]}),
-    *({"amplitudes": 12 * ["a"]}, {"amplitudes": 12 * [float("nan")]}, {"rejected": None}),
-    *({"amplitudes": 12 * [10**30]}, {"sha256": None}),
-    *({"accepted": 11, "rejected": [one]} for one in ({"index": 3}, {"index": 99}, "text", 3)),
-]
-
-
-@pytest.mark.parametrize("harm", IMPOSSIBLE)
+@pytest.mark.parametrize("harm", [{"split": "vrain"}, {"file": "/dev/zero"}, {"tried": 10**12}])
 def test_an_invalid_line_of_the_manifest_is_solved_again(copy, data, harm):
     found = lines(copy)
     assert found[0]["split"] == "train"
@@ -786,8 +546,15 @@ def test_an_invalid_line_of_the_manifest_is_solved_again(copy, data, harm):
     assert content(copy) == content(data.store)
 
 
-@pytest.mark.parametrize("name", ["scene.json", "manifest.jsonl", "modes.safetensors", "shard"])
-@pytest.mark.parametrize("harm", ["a link", "a loop", "a folder", "a pipe", "huge"])
+@pytest.mark.parametrize(
+    ("name", "harm"),
+    [
+        *(("scene.json", harm) for harm in ("a link", "huge", "a folder")),
+        *(("manifest.jsonl", harm) for harm in ("a loop", "a pipe", "huge")),
+        *(("modes.safetensors", harm) for harm in ("a folder", "a link", "huge")),
+        *(("shard", harm) for harm in ("a pipe", "a loop", "huge", "a link")),
+    ],
+)
 def test_irregular_files_are_refused_by_name_and_not_read(copy, tmp_path, name, harm):
     name = lines(copy)[0]["file"] if name == "shard" else name
     path = copy.folder / name
@@ -805,13 +572,6 @@ def test_irregular_files_are_refused_by_name_and_not_read(copy, tmp_path, name, 
     with pytest.raises(DataSetError, match=name) as refusal:
         read()
     assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize("harm", [b"", b"nothing", b"[" * 99_999, save({"values": torch.ones(3)})])
-def test_damaged_modes_are_refused_by_name(copy, harm):
-    (copy.folder / "modes.safetensors").write_bytes(harm)
-    with pytest.raises(DataSetError, match=r"modes\.safetensors is damaged.*action=repair"):
-        copy.modes()
 
 
 def test_modes_of_another_precision_are_found(copy):
@@ -835,10 +595,9 @@ def test_a_shard_under_the_name_of_another_is_refused(copy):
     line = first | {"first": 6400, "file": name, "rejected": [], "accepted": first["tried"]}
     with (copy.folder / "manifest.jsonl").open("a") as file:
         file.write(json.dumps(line) + "\n")
-    read = copy.reader("train")
-    assert read(0) is not None
+    assert len(copy.load("train", 12).force) == 12
     with pytest.raises(DataSetError, match=r"holds other loads than its line of the manifest"):
-        read(6400)
+        copy.load("train", 6401)
 
 
 def test_a_load_under_the_name_of_another_is_solved_again(fresh, data, scene):
@@ -867,70 +626,6 @@ def test_a_file_outside_the_folder_is_not_read(copy):
     ]
 
 
-@pytest.mark.parametrize("harm", [b"", b"half of it", None])
-def test_damaged_modes_are_found_and_written_again(copy, harm):
-    path = copy.folder / "modes.safetensors"
-    whole = path.read_bytes()
-    path.write_bytes(harm or b"") if harm is not None else path.unlink()
-    found = flaws(copy)
-    repair(copy)
-    fill(copy)
-    assert "modes.safetensors" in found
-    assert path.read_bytes() == whole
-
-
-def test_an_undamaged_set_has_no_flaw_and_repair_changes_nothing(copy, solved):
-    before = content(copy)
-    assert [flaw for _, flaw in verify(copy)] == 4 * [""]
-    assert not repair(copy)
-    assert fill(copy) == 0
-    assert solved == []
-    assert content(copy) == before
-
-
-def test_repair_solves_the_loads_of_damaged_shards_only(copy, data, solved):
-    before = content(data.store)
-    damaged = lines(copy)[1]
-    (copy.folder / damaged["file"]).write_bytes(b"nothing")
-    assert mended(copy) == [damaged["file"]]
-    fill(copy)
-    assert len(solved) == damaged["tried"]
-    after = content(copy)
-    manifests = [c.pop("manifest.jsonl").splitlines() for c in (after, before)]
-    assert after == before
-    assert sorted(manifests[0]) == sorted(manifests[1])
-
-
-def test_a_repaired_manifest_equals_that_of_a_set_made_at_once(copy, data):
-    (copy.folder / lines(copy)[0]["file"]).unlink()
-    repair(copy)
-    fill(copy)
-    assert content(copy) == content(data.store)
-
-
-def test_repair_retries_loads_that_the_machine_lost_only(hard, tmp_path, monkeypatch):
-    store = Store(tmp_path / "d", hard, 0)
-    sound = Store(tmp_path / "sound", hard, 0)
-    reasons = {1: f"{MACHINE_FAILURES[0]} after 1 s", 4: f"{MACHINE_FAILURES[1]} 3 times"}
-
-    def unlucky(scene, job):
-        if job.number in reasons:
-            return failed_load(scene, job, reasons[job.number])
-        return solve_load(scene, job)
-
-    monkeypatch.setattr(store_module, "SHARD_SIZE", 3)
-    fill(sound, {"train": range(9)})
-    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", unlucky)
-    fill(store, {"train": range(9)})
-    assert store.digest("train", 9) != sound.digest("train", 9)
-    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", solve_load)
-    assert mended(store) == ["train-000000.safetensors", "train-000003.safetensors"]
-    assert fill(store, {"train": store.missing("train", 9)}) == 6
-    assert store.digest("train", 9) == sound.digest("train", 9)
-    assert sorted(map(str, lines(store))) == sorted(map(str, lines(sound)))
-    assert not repair(store)
-
-
 def test_repair_removes_files_that_no_manifest_names(copy):
     before = content(copy)
     stray = copy.folder / "train-000012.safetensors"
@@ -947,20 +642,6 @@ def test_repair_removes_files_that_no_manifest_names(copy):
     assert content(copy) == before
 
 
-def test_a_torn_last_line_of_the_manifest_is_solved_again(copy, data, solved):
-    manifest = copy.folder / "manifest.jsonl"
-    whole = manifest.read_text().splitlines()
-    manifest.write_text("\n".join(whole[:-1]) + "\n" + whole[-1][:50])
-    torn = json.loads(whole[-1])
-    assert len(copy.missing(torn["split"], SIZES[torn["split"]])) == torn["tried"]
-    fill(copy)
-    assert len(solved) == torn["tried"]
-    for split, size in SIZES.items():
-        assert same(copy.load(split, size), data.store.load(split, size))
-    repair(copy)
-    assert content(copy) == content(data.store), "repair clears the torn line away"
-
-
 def test_a_line_torn_inside_its_reject_list_is_solved_again(hard, tmp_path):
     store = Store(tmp_path / "d", hard, 0)
     fill(store, {"train": range(6)})
@@ -970,31 +651,7 @@ def test_a_line_torn_inside_its_reject_list_is_solved_again(hard, tmp_path):
     assert store.missing("train", 6) == list(range(6))
 
 
-# ------------------------------------------------------------------ loads that came by a stream
-
-
-def test_collect_writes_whole_shards_of_pending_loads(data, fresh, scene, monkeypatch):
-    monkeypatch.setattr(store_module, "SHARD_SIZE", 4)
-    writer(fresh).create()
-    for number in (5, 1, 0, 2, 7, 6, 4):
-        fresh.pending.write(solve_load(scene, LoadKey((0, 0), number)))
-    writer(fresh).collect("train")
-    assert [line["first"] for line in lines(fresh)] == [4]
-    assert len(fresh.pending.files()) == 3
-    fresh.pending.write(solve_load(scene, LoadKey((0, 0), 3)))
-    writer(fresh).collect("train")
-    assert fresh.pending.files() == {}
-    assert fresh.digest("train", 8) == data.store.digest("train", 8)
-
-
-def test_a_pending_load_is_read_like_one_of_a_shard(data, fresh, scene):
-    writer(fresh).create()
-    fresh.pending.write(solve_load(scene, LoadKey((0, 0), 3)))
-    pending, stored = fresh.reader("train")(3), data.store.reader("train")(3)
-    assert pending["index"].tolist() == [3]
-    assert pending.keys() == stored.keys()
-    assert all(torch.equal(pending[name], column) for name, column in stored.items())
-    assert fresh.reader("train")(2) is None
+# ------------------------------------------------------------------ reports
 
 
 def test_the_summary_states_mean_iterations_and_size(copy):
@@ -1023,5 +680,5 @@ def test_a_line_that_names_the_shard_of_another_split_is_ignored(copy, data):
     first, other = (line for line in lines(copy) if line["first"] == 0 and line["split"] != "test")
     line = other | {"split": first["split"]}
     (copy.folder / "manifest.jsonl").write_text(json.dumps(line) + "\n")
-    assert [copy.reader(split)(0) for split in ("train", "val")] == [None, None]
+    assert not copy.tried("train") | copy.tried("val")
     assert "manifest.jsonl" in flaws(copy)

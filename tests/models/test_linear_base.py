@@ -242,7 +242,10 @@ def test_without_a_base_nothing_is_solved(scene, batch, monkeypatch):
 @pytest.mark.parametrize("data", ["offline", pytest.param("online", marks=pytest.mark.slow)])
 def test_a_run_is_loaded_and_evaluated(script, tiny, tmp_path, data):
     sizes = ["data.val=2", "data.test=2", "data.batch_size=4", "data.workers=0"]
-    sizes += {"offline": ["data.train=4", "data.symmetry=true"], "online": ["data.batches=2"]}[data]
+    sizes += {
+        "offline": ["data.train=4", "data.symmetry=true"],
+        "online": ["data.train.batches=2"],
+    }[data]
     short = ["model.width=4", "trainer.max_epochs=1", "trainer.check_val_every_n_epoch=1"]
     options = [*tiny, "experiment=gnn_linear", f"data={data}", *sizes, *short, "run=run"]
     trained = script("train", *options, cwd=tmp_path)

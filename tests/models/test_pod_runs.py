@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dpl.config import build, run_folder
-from dpl.data import OnlineData
+from dpl.data import Stream
 from dpl.training import Surrogate
 from dpl.training.checkpoints import read
 from dpl.training.surrogate import scales
@@ -143,12 +143,17 @@ def test_a_run_resumed_before_its_first_epoch_fits_its_bases(script, overrides, 
 
 def test_a_stream_fits_the_bases_to_the_validation_loads(script, overrides, home, trained):
     kept = [o for o in overrides("stream") if "data.train" not in o]
-    more = ["data=online", "data.batches=2", "data.new_per_round=4", "trainer.max_epochs=2"]
+    more = [
+        "data=online",
+        "data.train.batches=2",
+        "data.train.new_per_round=4",
+        "trainer.max_epochs=2",
+    ]
     ended = script("train", *kept, *more, cwd=home)
     assert ended.status == 0, ended.err
     cfg, module = run_folder.load_run(home / "stream")
     data = build.instantiate(cfg, "data", scene=module.scene)
-    assert isinstance(data, OnlineData)
+    assert isinstance(data.source, Stream)
     expected = build.build_surrogate(cfg, module.scene)
     expected.fit_bases(data.samples("val"))
     assert alike(dict(expected.net.named_buffers()), dict(module.net.named_buffers()))
@@ -159,7 +164,12 @@ def test_a_stream_fits_the_bases_to_the_validation_loads(script, overrides, home
 
 def test_skipped_work_of_a_stream_mentions_coordinates_from_disk_only(script, overrides, home):
     kept = [o for o in overrides("reported") if "data.train" not in o]
-    more = ["data=online", "data.batches=1", "data.new_per_round=4", "trainer.max_epochs=1"]
+    more = [
+        "data=online",
+        "data.train.batches=1",
+        "data.train.new_per_round=4",
+        "trainer.max_epochs=1",
+    ]
     ended = script("train", *kept, *more, cwd=home)
     assert ended.status == 0
     assert "no fields in training:" not in ended.out

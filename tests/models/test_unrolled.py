@@ -4,8 +4,9 @@ import lightning as L
 import pytest
 import torch
 
+from dpl import training
 from dpl.config import run_folder
-from dpl.data import OfflineData
+from dpl.data import DataModule
 from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle, solve
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
@@ -398,15 +399,14 @@ def test_the_held_out_error_is_the_mean_norm_of_the_errors_of_the_map(beam, monk
         assert reported == pytest.approx(direct, rel=1e-5)  # linear solutions in float32
 
 
-def test_a_trainer_of_the_user_fits_it(beam, tmp_path):
-    """Nothing is validated before the fit, also with Lightning's defaults."""
-    data = OfflineData(beam, folder=tmp_path, train=12, val=4, test=2, workers=0)
+def test_a_surrogate_is_fitted_without_a_trainer(beam, tmp_path):
+    data = DataModule(beam, folder=tmp_path, train=12, val=4, test=2, workers=0)
     surrogate = Surrogate(Unrolled(beam, **SMALL), MSE(), beam)
-    options = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    trainer = L.Trainer(max_epochs=2, accelerator="cpu", enable_model_summary=False, **options)
-    trainer.fit(surrogate, datamodule=data)
+    e_mean = training.fit(surrogate, data)
     assert surrogate.net.is_fitted
-    assert float(trainer.callback_metrics["val/rel_L2_median"]) < 0.05
+    assert e_mean == training.closed_form.validation_errors(surrogate, data)["val/e_mean"] < 1e-4
+    with pytest.raises(TypeError, match=r"call dpl\.training\.fit"):
+        L.Trainer(logger=False, enable_checkpointing=False, accelerator="cpu").fit(surrogate, data)
 
 
 def test_a_stored_error_outside_the_modes_far_below_a_measured_one_is_not_used(beam, net):

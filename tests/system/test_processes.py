@@ -38,22 +38,6 @@ STARTS = {
         from dpl.system.processes import spawn_context
         spawn_context().Process(target=task, daemon=True).start()
     """,
-    "a worker of a stream": """
-        from dpl.data.replay_buffer import ReplayBuffer
-        from torch.utils.data import IterableDataset
-
-        class Source(IterableDataset):
-            first, rank, world_size, offsets, hard_examples = 0, 0, 1, {}, None
-
-            def __iter__(self):
-                task()
-
-        globals()["Source"] = Source
-        Source.__qualname__ = "Source"
-        sizes = {"batch_size": 1, "batches": 1, "new_per_round": 1, "reuse": 1, "capacity": 4}
-        replay = ReplayBuffer(Source(), workers=1, **sizes)
-        replay._start()
-    """,
 }
 MOMENTS = {
     "at once": "os.kill(os.getpid(), signal.SIGKILL)",

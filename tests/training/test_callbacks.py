@@ -26,7 +26,7 @@ from tensorboard.plugins.hparams import api_pb2, get_experiment, list_session_gr
 from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.util import tensor_util
 
-from dpl.data import OnlineData
+from dpl.data import DataModule, Stream
 from dpl.fem import box, rectangle, surface
 from dpl.models import FCNN
 from dpl.training import (
@@ -330,8 +330,9 @@ def test_rates_exclude_the_time_of_validation(scene, data, tmp_path):
 
 
 def test_a_stream_logs_its_production_rate_and_buffer_size(scene, folder, data, tmp_path):
-    options = {"val": 4, "test": 4, "workers": 0, "batch_size": 4, "batches": 3}
-    module = OnlineData(scene, folder=str(folder), new_per_round=4, reuse=1, capacity=64, **options)
+    stream = Stream(batches=3, new_per_round=4, reuse=1, capacity=64)
+    options = {"val": 4, "test": 4, "workers": 0, "batch_size": 4}
+    module = DataModule(scene, folder=str(folder), train=stream, **options)
     threads = torch.get_num_threads()
     tutor = trainer(tmp_path, ThroughputMonitor(), epochs=3)
     tutor.fit(surrogate(scene), datamodule=module)

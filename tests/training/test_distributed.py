@@ -128,11 +128,11 @@ def test_two_processes_share_one_stream(trained):
     online = [
         "data=online",
         "data.workers=0",
-        "data.batches=2",
-        "data.new_per_round=8",
-        "data.reuse=1",
+        "data.train.batches=2",
+        "data.train.new_per_round=8",
+        "data.train.reuse=1",
     ]
-    status, _, err, ranks = trained(*online, "data.cache=true", "trainer.max_epochs=2", "run=r")
+    status, _, err, ranks = trained(*online, "trainer.max_epochs=2", "run=r")
     assert status == 0, err[-3000:]
     (weights, *seen), (others, *rest) = ranks
     assert weights == others

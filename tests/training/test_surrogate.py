@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
-from dpl.data import OfflineData, OnlineData
+from dpl.data import DataModule, Stream
 from dpl.fem import Load
 from dpl.models import FCNN
 from dpl.models.linear_base import sampled_solutions
@@ -318,7 +318,7 @@ def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
 ):
     def fresh():
         options = {"train": 12, "val": 4, "test": 4, "batch_size": 4, "workers": 0}
-        return OfflineData(scene, folder=str(folder), **options)
+        return DataModule(scene, folder=str(folder), **options)
 
     straight, whole = run(scene, tmp_path / "straight", fresh(), loss=loss)
     half, part = run(scene, tmp_path / "parts", fresh(), stop=2, loss=loss)
@@ -362,7 +362,7 @@ def test_a_resumed_run_of_a_network_with_dropout_draws_the_same_numbers(
         module = Surrogate(Noisy(scene), MSE(), scene, scheduler=warmup_cosine)
         trainer(tmp_path / name, *callbacks, max_epochs=4).fit(
             module,
-            datamodule=OfflineData(scene, folder=str(folder), **options),
+            datamodule=DataModule(scene, folder=str(folder), **options),
             ckpt_path=resume,
             weights_only=True,
         )
@@ -456,10 +456,9 @@ def test_the_seed_determines_the_weights(scene, data, tmp_path):
 
 def test_an_interrupted_stream_continues_with_new_loads(scene, folder, data, tmp_path):
     def stream():
-        return OnlineData(
-            scene, folder=str(folder), val=4, test=4, workers=0, batch_size=4, batches=3,
-            new_per_round=4, reuse=1, capacity=16,
-        )  # fmt: skip
+        source = Stream(batches=3, new_per_round=4, reuse=1, capacity=16)
+        options = {"val": 4, "test": 4, "workers": 0, "batch_size": 4}
+        return DataModule(scene, folder=str(folder), train=source, **options)
 
     _, part = run(scene, tmp_path, stream(), stop=1)
     assert part.datamodule.state_dict() == {"next_index": 12}

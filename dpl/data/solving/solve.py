@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from dpl.fem import Load, Status, solve
 from dpl.scene import Scene
@@ -55,16 +54,16 @@ class SolvedLoad(NamedTuple):
     reason: str
 
 
-def solve_load(scene: Scene, job: LoadKey, *, point: Tensor | None = None) -> SolvedLoad:
-    """Draw and solve a load, from a point of the unit cube (d,); None: that of the stream."""
-    load, where = _draw(scene, job, point)
+def solve_load(scene: Scene, job: LoadKey) -> SolvedLoad:
+    """Draw and solve a load."""
+    load, point = _draw(scene, job)
     start = time.perf_counter()
     with one_thread():
         solution = solve(scene.solver, load)
     accepted = bool(solution.stable)
     return SolvedLoad(
         job=job,
-        point=where,
+        point=point,
         force=load.force[0].numpy(),
         displacement=solution.displacement[0].numpy(),
         amplitude=_amplitude(scene, load),
@@ -80,10 +79,10 @@ def solve_load(scene: Scene, job: LoadKey, *, point: Tensor | None = None) -> So
 
 def failed_load(scene: Scene, job: LoadKey, reason: str, seconds: float = 0.0) -> SolvedLoad:
     """Return a rejected load whose solve did not end: a time-out or a dead worker."""
-    load, where = _draw(scene, job, None)
+    load, point = _draw(scene, job)
     force = load.force[0].numpy()
     return SolvedLoad(
-        *(job, where, force, 0 * force, _amplitude(scene, load), False, np.nan, np.nan),
+        *(job, point, force, 0 * force, _amplitude(scene, load), False, np.nan, np.nan),
         *(0.0, 0, seconds, reason),
     )
 
@@ -92,6 +91,7 @@ def _amplitude(scene: Scene, load: Load) -> float:
     return float(scene.problem.acting(load.force).norm()) / scene.loads.largest_force
 
 
-def _draw(scene: Scene, job: LoadKey, point: Tensor | None) -> tuple[Load, NDArray[np.float64]]:
-    points = scene.loads.points(job.seed, [job.number]) if point is None else point[None]
+def _draw(scene: Scene, job: LoadKey) -> tuple[Load, NDArray[np.float64]]:
+    """Return a load and the point of the unit cube that it is drawn from, (d,)."""
+    points = scene.loads.points(job.seed, [job.number])
     return scene.loads.loads_at(points), points[0].numpy()

@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from itertools import islice
 from multiprocessing import connection
 from multiprocessing.connection import Connection
@@ -83,7 +83,7 @@ def solve_loads(
     workers: int,
     timeout: float | None = None,
     stop: object = None,
-) -> Iterator[SolvedLoad]:
+) -> Generator[SolvedLoad, None, None]:
     """Yield solved loads in the order in which they are finished.
 
     Args:

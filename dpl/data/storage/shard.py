@@ -17,7 +17,6 @@ Columns = dict[str, Tensor]
 
 INTEGERS = dict.fromkeys(("index", "n_loaded_nodes", "iterations"), torch.int64)
 INTEGERS["node"] = torch.int32
-OF_NODES = {"node", "nodal_force"}  # columns with a row for each loaded node
 FINITE = {"point", "nodal_force", "displacement", "parameters"}  # columns of a sample
 
 
@@ -98,13 +97,6 @@ def _flaw_of_columns(
     if not ((shard["node"] >= 0) & (shard["node"] < shape[0])).all():
         return "a loaded node does not exist"
     return ""
-
-
-def select(shard: Columns, number: int) -> Columns:
-    """Return the columns of one load of a shard; they have no rows if the load was rejected."""
-    row = shard["index"] == number
-    node = torch.repeat_interleave(row, shard["n_loaded_nodes"])
-    return {name: c[node if name in OF_NODES else row] for name, c in shard.items()}
 
 
 def to_sparse(force: Tensor) -> Columns:

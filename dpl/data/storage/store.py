@@ -15,7 +15,7 @@ workers and after any interruption.
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,12 +27,11 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
-from dpl.data.solving.solve import LoadKey
 from dpl.data.storage.acceptance import AmplitudeBin, acceptance_table, amplitude_bins
 from dpl.data.storage.journal import read_sessions
 from dpl.data.storage.manifest import STREAMS, accepted_loads, read_manifest, sort_key, tried_loads
 from dpl.data.storage.pending import PendingLoads
-from dpl.data.storage.shard import Columns, decode_shard, select, to_dense
+from dpl.data.storage.shard import Columns, decode_shard, to_dense
 from dpl.scene import Sample, Scene
 from dpl.system.files import DataSetError, read_regular_file
 
@@ -213,29 +212,6 @@ class Store:
         shape, n_parameters = self.scene.problem.shape, len(loads.parameter_ranges)
         return decode_shard(content, shape, loads.n_random, n_parameters)
 
-    def reader(self, split: str) -> Callable[[int], Columns | None]:
-        """Return a function from the number of a load to its columns, None if it is not solved yet.
-
-        The columns have no rows if the load was rejected.
-        """
-        lines = {number: line for line in self._shards_of(split) for number in tried_loads(line)}
-        pending = self.pending.files()
-        shard: Columns = {}
-        current: dict[str, Any] | None = None  # line of `shard`
-
-        def read(number: int) -> Columns | None:
-            nonlocal shard, current
-            if line := lines.get(number):
-                if current is not line:
-                    shard, current = self._read_shard(line), line
-                return select(shard, number)
-            with suppress(FileNotFoundError):  # another process has moved it into a shard
-                if path := pending.get(LoadKey(self.stream(split), number)):
-                    return select(self.pending.read(path)[1], number)
-            return None
-
-        return read
-
     def digest(self, split: str, count: int) -> str:
         """Return the SHA-256 of the samples of a split; it does not depend on the shard size."""
         found = hashlib.sha256()
@@ -296,16 +272,15 @@ class Store:
         return sum(one["seconds"] for one in sessions) / loads if loads else None
 
 
-def runs(numbers: Sequence[int], *, whole: bool = False) -> Iterator[list[int]]:
+def runs(numbers: Sequence[int]) -> Iterator[list[int]]:
     """Yield the loads of each file, of `numbers` in ascending order.
 
-    They are consecutive and never across a multiple of SHARD_SIZE; `whole`: SHARD_SIZE loads only.
+    They are consecutive and never across a multiple of SHARD_SIZE.
     """
     run: list[int] = []
     for number in [*numbers, None]:
         if run and (number is None or number != run[-1] + 1 or number % SHARD_SIZE == 0):
-            if not whole or len(run) == SHARD_SIZE:
-                yield run
+            yield run
             run = []
         if number is not None:
             run.append(number)

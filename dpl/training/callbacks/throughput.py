@@ -11,7 +11,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from dpl.data import OnlineData
+from dpl.data import DataModule
 
 
 class ThroughputMonitor(L.Callback):
@@ -53,7 +53,7 @@ class ThroughputMonitor(L.Callback):
         sums = {"rate/consumed": self._samples / seconds, "memory/process": resident_memory()}
         means = {"rate/steps": (trainer.global_step - self._steps) / seconds}
         data = getattr(trainer, "datamodule", None)
-        if isinstance(data, OnlineData) and (rates := data.rates) is not None:
+        if isinstance(data, DataModule) and (rates := data.source.rates) is not None:
             sums |= {"rate/produced": rates.produced, "online/buffer": float(rates.buffer)}
             means |= {"online/waiting": rates.waiting, "online/uses": rates.uses}
         if pl_module.device.type == "cuda":

@@ -65,7 +65,7 @@ class WorstCasePlots(L.Callback):
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         """Count validations and draw when the count reaches the next picture."""
-        if trainer.sanity_checking or trainer.state.fn != "fit":
+        if trainer.sanity_checking or trainer.state.fn == "validate":
             return
         self._validations += 1
         if self._validations >= self._next:

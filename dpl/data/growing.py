@@ -8,8 +8,10 @@ from typing import Any
 from dpl.data.background import BackgroundSolver
 from dpl.data.dataset import MAX_LOADS, DataSet
 from dpl.data.learning_curve import CurvePoint, describe, loads_for
-from dpl.data.storage.store import SHARD_SIZE
+from dpl.data.sources import Source
+from dpl.data.storage.store import SHARD_SIZE, Store
 from dpl.system.checks import check_range
+from dpl.system.threads import leave_cores
 
 PATIENCE = 2  # fits without gain after which the growth ends
 MIN_GAIN = 0.95  # ratio of errors from which a fit is one without gain
@@ -19,7 +21,7 @@ MIN_FACTOR = math.sqrt(2)
 MAX_FACTOR = 4
 
 
-class Growth:
+class Growing(Source):
     """Training loads that are solved in the background while a model is fitted to the first ones.
 
     After the first `SHARD_SIZE` training loads the model is fitted and its error on held-out loads
@@ -33,18 +35,14 @@ class Growth:
     """
 
     def __init__(
-        self, dataset: DataSet, *, error: float, minutes: float | None, max_train: int
+        self, *, error: float = 1e-3, minutes: float | None = None, max_train: int = 10_000
     ) -> None:
-        """Check the arguments; nothing is solved before `next_sizes`.
+        """Check the arguments.
 
         Args:
-            dataset: The data set; its numbers of validation and test loads are those wanted.
             error: Median over held-out loads of the relative L2 error at which the growth ends [-].
             minutes: Time after which the growth ends [min]; None: no limit.
             max_train: Largest number of training loads.
-
-        Raises:
-            ValueError: A number is out of range.
         """
         if not 0 < error < math.inf:
             raise ValueError(f"error = {error} must be above 0")
@@ -52,7 +50,6 @@ class Growth:
             raise ValueError(f"minutes = {minutes} must be above 0 [min], or null")
         check_range(1, MAX_LOADS, max_train=max_train)
         self.points: list[CurvePoint] = []
-        self._dataset = dataset
         self._error, self._minutes, self._max_train = error, minutes, max_train
         self._solver: BackgroundSolver | None = None
         self._start = self._fit_start = time.monotonic()
@@ -60,47 +57,56 @@ class Growth:
 
     # ------------------------------------------------------------------ sizes
 
-    def held_out(self, train: int) -> int:
-        """Return the number of held-out loads for a number of training loads."""
-        return min(self._dataset.val, max(HELD_OUT, train // 2))
+    def count(self, store: Store) -> int:
+        """Return the number of training loads of the last fit, or of those that are there."""
+        return self.points[-1].loads if self.points else len(store.tried("train"))
 
-    def _loads(self) -> Iterator[tuple[str, range]]:
-        """Yield splits and loads in the order of the solves; the rest once the growth has ended."""
-        val = 0
-        for train in range(0, self._max_train, SHARD_SIZE):
-            if self.is_finished:
-                break
-            end = min(train + SHARD_SIZE, self._max_train)
-            yield "val", range(val, self.held_out(end))
-            yield "train", range(train, end)
-            val = self.held_out(end)
-        yield "val", range(val, self._dataset.val)
-        yield "test", range(self._dataset.test)
+    def fits(self, dataset: DataSet) -> Iterator[dict[str, int]]:
+        """Solve loads in the background; yield the numbers of training and held-out loads of fits.
 
-    def next_sizes(self) -> dict[str, int]:
-        """Wait for the loads of the next fit; return the numbers of training and held-out loads.
+        The errors of each fit have to be recorded before the next one. The loads of validation and
+        test are solved at the end.
+
+        Args:
+            dataset: The data set; its numbers of validation and test loads are those wanted.
 
         Raises:
             DataSetError: The folder holds something else, or another process writes there.
             RuntimeError: Workers die repeatedly.
         """
         if self.is_finished:
-            return self._sizes(self.points[-1].loads)
-        if self._solver is None:
-            self._start = time.monotonic() - (self.points[-1].seconds if self.points else 0.0)
-            self._solver = BackgroundSolver(self._dataset, self._loads())
+            return
+        leave_cores(dataset.workers)
+        self._start = time.monotonic() - (self.points[-1].seconds if self.points else 0.0)
+        self._solver = BackgroundSolver(dataset, self._loads(dataset))
+        while not self.is_finished:
+            yield self._next_sizes(self._solver, dataset.val)
+        self._solver.wait({"val": dataset.val, "test": dataset.test}, show=True)
+
+    def _loads(self, dataset: DataSet) -> Iterator[tuple[str, range]]:
+        """Yield splits and loads in the order of the solves; the rest once the growth has ended."""
+        val = 0
+        for train in range(0, self._max_train, SHARD_SIZE):
+            if self.is_finished:
+                break
+            end = min(train + SHARD_SIZE, self._max_train)
+            yield "val", range(val, _held_out(end, dataset.val))
+            yield "train", range(train, end)
+            val = _held_out(end, dataset.val)
+        yield "val", range(val, dataset.val)
+        yield "test", range(dataset.test)
+
+    def _next_sizes(self, solver: BackgroundSolver, val: int) -> dict[str, int]:
+        """Wait for the loads of the next fit; return the numbers of training and held-out loads."""
         least, most = self._limits()
-        self._solver.wait(self._sizes(least), until=self._deadline(), show=not self.points)
+        solver.wait(_sizes(least, val), until=self._deadline(), show=not self.points)
         self._fit_start = time.monotonic()
-        available = self._solver.count("train")
-        while available and self._solver.count("val") < self.held_out(available):
+        available = solver.count("train")
+        while available and solver.count("val") < _held_out(available, val):
             available = max(0, available - SHARD_SIZE)
         if available < least:  # the time is over
-            return self._sizes(max(available, self.points[-1].loads if self.points else 1))
-        return self._sizes(max(least, min(most, available // SHARD_SIZE * SHARD_SIZE)))
-
-    def _sizes(self, train: int) -> dict[str, int]:
-        return {"train": train, "val": self.held_out(train)}
+            return _sizes(max(available, self.points[-1].loads if self.points else 1), val)
+        return _sizes(max(least, min(most, available // SHARD_SIZE * SHARD_SIZE)), val)
 
     def _limits(self) -> tuple[int, int]:
         """Return the smallest and the largest number of training loads of the next fit."""
@@ -129,15 +135,14 @@ class Growth:
 
         Args:
             loads: Number of training loads.
-            errors: `rel_L2_median`, `rel_L2_worst` and `e_mean`, see `dpl.training.metrics`.
+            errors: `median`, `worst` and `e_mean`, see `CurvePoint`.
 
         Returns:
             The errors and the number of loads that the target is expected to need, in words.
         """
         now = time.monotonic()
         self._fit_seconds = now - self._fit_start
-        median, worst, e_mean = (errors[n] for n in ("rel_L2_median", "rel_L2_worst", "e_mean"))
-        self.points.append(CurvePoint(loads, now - self._start, median, worst, e_mean))
+        self.points.append(CurvePoint(loads, now - self._start, **errors))
         line = describe(self.points, self._error)
         reason = self._limit_reached
         return f"{line}; {reason}" if reason else line
@@ -156,26 +161,21 @@ class Growth:
         if last.median <= self._error:
             return ""
         if last.loads >= self._max_train:
-            return f"data.max_train = {self._max_train} reached"
+            return f"data.train.max_train = {self._max_train} reached"
         medians = [point.median for point in self.points]
         before, recent = medians[:-PATIENCE], medians[-PATIENCE:]
         if before and min(recent) > MIN_GAIN * min(before):
             return f"{PATIENCE} fits without gain: more loads no longer reduce the error"
         # the next fit would take at least as long as the last one
         if self._minutes is not None and last.seconds + self._fit_seconds >= 60 * self._minutes:
-            return f"data.minutes = {self._minutes:g} reached"
+            return f"data.train.minutes = {self._minutes:g} reached"
         return ""
 
     # ------------------------------------------------------------------ end
 
     def close(self) -> None:
-        """End the workers; the loads of validation and test are solved if the growth has ended."""
-        if self._solver is None:
-            return
-        try:
-            if self.is_finished:
-                self._solver.wait({"val": self._dataset.val, "test": self._dataset.test}, show=True)
-        finally:
+        """Finish the solves in progress and end the workers."""
+        if self._solver is not None:
             self._solver.close()
             self._solver = None
 
@@ -185,4 +185,13 @@ class Growth:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue a learning curve."""
-        self.points = [CurvePoint(*point) for point in state["points"]]
+        self.points = [CurvePoint(int(n), *map(float, rest)) for n, *rest in state["points"]]
+
+
+def _held_out(train: int, val: int) -> int:
+    """Return the number of held-out loads, of `val`, for a number of training loads."""
+    return min(val, max(HELD_OUT, train // 2))
+
+
+def _sizes(train: int, val: int) -> dict[str, int]:
+    return {"train": train, "val": _held_out(train, val)}

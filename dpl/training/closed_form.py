@@ -1,0 +1,141 @@
+"""Training of a model in closed form: a fit for each number of loads of its data set."""
+
+import math
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import lightning as L
+import torch
+
+from dpl.data.datamodule import DataModule
+from dpl.models.protocols import ClosedFormFit
+from dpl.training import checkpoints
+from dpl.training.callbacks.tensorboard import LogHyperparameters
+from dpl.training.callbacks.throughput import resident_memory
+from dpl.training.callbacks.training_time import TrainingTime
+from dpl.training.callbacks.worst_cases import WorstCasePlots
+from dpl.training.surrogate import Surrogate
+
+# metrics of a learning curve, by their names there
+METRICS = {"median": "rel_L2_median", "worst": "rel_L2_worst", "e_mean": "e_mean"}
+OBSERVERS = (LogHyperparameters, TrainingTime, WorstCasePlots)
+
+
+def fit(
+    surrogate: Surrogate,
+    data: DataModule,
+    *,
+    trainer: L.Trainer | None = None,
+    folder: Path | None = None,
+) -> float:
+    """Fit the network of a surrogate to the training samples, on the CPU.
+
+    `Stored` samples are fitted once. A source that is `Growing` repeats the fit with more loads.
+    After each fit its errors on the validation samples are printed, logged, and written with the
+    weights.
+
+    Args:
+        surrogate: The surrogate; its network is a `ClosedFormFit`.
+        data: The data module; missing loads are solved.
+        trainer: Its loggers take the errors, and its callbacks of the kinds `OBSERVERS` observe the
+            fits. Its other parts have no effect.
+        folder: Folder of the run, for checkpoints that `dpl.load` reads; None: none are written.
+
+    Returns:
+        The smallest `MeanError` of the fits on the validation samples [-]; infinite if no error is
+        finite.
+
+    Raises:
+        DataSetError: The folder of the data holds something else, or another process writes there.
+        KeyboardInterrupt: The training was interrupted; solved loads and checkpoints are kept.
+        SystemExit: After SIGTERM, with status 143.
+    """
+    net = cast(ClosedFormFit, surrogate.cpu().net)
+    loggers, callbacks = (trainer.loggers, trainer.callbacks) if trainer else ([], [])
+    if trainer is not None:
+        trainer.datamodule = data  # whose validation samples are drawn
+
+    def call(hook: str, *more: Any) -> None:
+        for one in callbacks:
+            if isinstance(one, OBSERVERS):
+                getattr(one, hook)(trainer, surrogate, *more)
+
+    done = [point.e_mean for point in data.source.points]
+    best, first, step = min(filter(math.isfinite, done), default=math.inf), len(done), None
+    try:
+        with _exit_on_sigterm():
+            for step, sizes in enumerate(data.source.fits(data.dataset), first):
+                if step == first:
+                    call("setup", "fit")
+                    call("on_train_start")
+                    call("on_train_epoch_start")
+                data.sizes |= sizes
+                net.fit(data.samples("train"), data.samples("val"))
+                errors = validation_errors(surrogate, data)
+                curve = {name: errors[f"val/{metric}"] for name, metric in METRICS.items()}
+                print(data.source.record(sizes["train"], curve), flush=True)
+                numbers = {**errors, "epoch": step, "memory/process": resident_memory()}
+                points = {f"learning_curve/{m}": errors[f"val/{m}"] for m in METRICS.values()}
+                for logger in loggers:
+                    logger.log_metrics(numbers, step=step)
+                    logger.log_metrics(points, step=sizes["train"])
+                    logger.save()
+                improved, best = curve["e_mean"] < best, min(best, curve["e_mean"])
+                if folder is not None:
+                    _write(surrogate, data, folder / "checkpoints", improved=improved)
+                call("on_validation_epoch_end")
+        if step is not None:
+            call("on_train_end")
+    finally:
+        data.source.close()
+        call("on_fit_end")
+        for logger in loggers:
+            logger.finalize("finished")
+    return best
+
+
+def validation_errors(surrogate: Surrogate, data: DataModule) -> dict[str, float]:
+    """Return the metrics `val/NAME` and the mean loss `loss/val` on the validation samples."""
+    metrics, loss, count = surrogate.eval().val_metrics, 0.0, 0
+    metrics.reset()
+    with torch.no_grad():
+        for batch in data.val_dataloader():
+            prediction, size = surrogate.predict(batch.load), len(batch.force)
+            metrics.update(prediction, batch)
+            loss += size * float(surrogate.loss(prediction, batch, surrogate.physics))
+            count += size
+    found = {name: float(value) for name, value in metrics.compute().items()}
+    return {**found, "loss/val": loss / count}
+
+
+def _write(surrogate: Surrogate, data: DataModule, folder: Path, *, improved: bool) -> None:
+    """Write the checkpoint from which a run is resumed, and the best weights if they improved."""
+    checkpoint: dict[str, Any] = {
+        **{key: {} for key in checkpoints.RESUME_KEYS},  # a fit has no state of an optimiser
+        "state_dict": surrogate.state_dict(),
+        "epoch": 0,
+        "global_step": 0,
+        checkpoints.DATA: data.state_dict(),
+    }
+    surrogate.on_save_checkpoint(checkpoint)
+    if improved:
+        checkpoints.write(checkpoint, folder / f"best{checkpoints.WEIGHTS}")
+    checkpoints.write(checkpoint, folder / "last.ckpt")
+
+
+@contextmanager
+def _exit_on_sigterm() -> Iterator[None]:
+    """Let SIGTERM raise SystemExit with status 143, in the main thread of a process only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
