@@ -292,13 +292,12 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "training.Surrogate":
 def _network(cfg: DictConfig, scene: Scene) -> tuple[Any, dict[str, Any]]:
     """Return the network of `model`, and those of its keys that are options of the surrogate."""
     require_keys(cfg, "model")
-    node = typing.cast("DictConfig", cfg.model)
-    predictor = {key: node[key] for key in validation.PREDICTOR if key in node}
+    node = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg.model, resolve=True))
+    predictor = {key: node.pop(key) for key in validation.PREDICTOR if key in node}
     with error_in("model"):
         inputs = models.Inputs.from_scene(scene, **predictor)
-    own = OmegaConf.masked_copy(node, [str(key) for key in node if key not in predictor])
     more = {"inputs": inputs} if "inputs" in validation.options_of(node) else {}
-    return instantiate(OmegaConf.create({"model": own}), "model", scene=scene, **more), predictor
+    return instantiate(OmegaConf.create({"model": node}), "model", scene=scene, **more), predictor
 
 
 def build_trainer(cfg: DictConfig) -> "L.Trainer":

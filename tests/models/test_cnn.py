@@ -211,7 +211,7 @@ def test_skipped_work_describes_the_network(scene):
 
 def test_fields_of_two_and_three_dimensions_are_accepted(body):
     force = field(body)
-    answer = network(body)(force)
+    answer = answer_of(network(body), force)
     assert answer.shape == force.shape
     assert answer.dtype == torch.float32
 

@@ -90,7 +90,8 @@ def test_predictions_are_invariant_under_translations(make_scene):
     assert not torch.allclose(one.problem.points, other.problem.points)
     force = forces(one)
     with torch.no_grad():
-        assert torch.allclose(build(one)(force), build(other)(force), rtol=1e-4, atol=1e-5)
+        answers = [answer_of(build(scene), force) for scene in (one, other)]
+    assert torch.allclose(*answers, rtol=1e-4, atol=1e-5)
 
 
 def test_the_network_overfits_one_batch_of_tetrahedra(make_scene):
