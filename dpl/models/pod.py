@@ -46,8 +46,8 @@ class PODNet(nn.Module):
 
     Attributes:
         modes: Orthonormal modes of the displacement, 0 at fixed degrees of freedom, (R, N D).
-        projection: Map from fields to inputs of the network, (N D, M): orthonormal modes of the
-            field over their sizes (`partial_whitening`), if the field is not whitened before.
+        projection: Map from fields to inputs of the network: orthonormal modes of the field over
+            `partial_whitening`, (N D, M).
         output_scale: Scale of each coordinate of the displacement, (R,).
     """
 
@@ -88,7 +88,6 @@ class PODNet(nn.Module):
             raise ValueError(f"blocks = {blocks} must be 0 or more and at most {MAX_BLOCKS}")
         self.scene = scene
         inputs = inputs or Inputs.from_scene(scene)
-        self._whitened = inputs.is_displacement
         rank = min(rank, int(scene.problem.free.sum()))
         coordinates = min(coordinates, int(inputs.dofs.sum()))
         count = coordinates + inputs.scalars
@@ -131,8 +130,7 @@ class PODNet(nn.Module):
         size = root_mean_square(output @ modes)
         self.output_scale.copy_((size * size.max()).sqrt())
         modes = _modes(weight * field, self.projection.shape[1])
-        size = root_mean_square(field @ modes)
-        self.projection.copy_(modes / (size.max() if self._whitened else partial_whitening(size)))
+        self.projection.copy_(modes / partial_whitening(root_mean_square(field @ modes)))
 
     def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
         """Return Newton's method in the first modes; see `Correctable`.
