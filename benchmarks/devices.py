@@ -15,31 +15,30 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning.fabric.utilities import move_data_to_device
 from torch import nn
 
-from dpl.data.datamodule import Samples
 from dpl.evaluation.timing import percentiles
 from dpl.fem import Load
 from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
-from dpl.models.protocols import ClosedFormFit, TrainsInCoordinates
+from dpl.models.inputs import Base
 from dpl.scene import Sample, Scene
 from dpl.training import MSE, Surrogate
 
-Build = Callable[[Scene], nn.Module]
-NETWORKS: dict[str, Build] = {
-    "fcnn": partial(FCNN, width=512),
-    "fcnn linear": partial(FCNN, width=512, base="linear"),
-    "fcnn full": partial(FCNN, all_dofs=True),  # of the paper, 4 n^2 + 7 n parameters
-    "cnn": CNN,
-    "cnn linear": partial(CNN, base="linear"),
-    "gnn": GNN,
-    "gnn linear": partial(GNN, base="linear"),
-    "pod": PODNet,
-    "unrolled": Unrolled,
+FIT = "unrolled"  # has no training step
+NETWORKS: dict[str, tuple[Callable[..., nn.Module], Base | None]] = {
+    "fcnn": (partial(FCNN, width=512), None),
+    "fcnn linear": (partial(FCNN, width=512), "linear"),
+    "fcnn full": (partial(FCNN, all_dofs=True), None),  # of the paper, 4 n^2 + 7 n parameters
+    "cnn": (CNN, None),
+    "cnn linear": (CNN, "linear"),
+    "gnn": (GNN, None),
+    "gnn linear": (GNN, "linear"),
+    "pod": (PODNet, None),
+    FIT: (lambda scene, _: Unrolled(scene), None),
 }
 TRAINING = "training step"
 RESIDENT, COPIED = "prediction", "prediction with copies"  # inputs on the device; on the host
@@ -171,8 +170,8 @@ def measure(name: str, scene: Scene, samples: Sample, plan: Plan) -> Iterator[De
         plan: Sizes of the measurement.
     """
     try:
-        surrogate = fitted(NETWORKS[name](scene), scene, samples)
-        dataset = surrogate.encode(samples) or Samples(samples)
+        surrogate = fitted(name, scene, samples)
+        dataset = surrogate.encode(samples)
         surrogate.to(plan.clock.device)
     except OUT_OF_MEMORY as error:
         yield f"{name}: {first_line(error)}"
@@ -182,7 +181,7 @@ def measure(name: str, scene: Scene, samples: Sample, plan: Plan) -> Iterator[De
         for batch in plan.predictions
         for task in (RESIDENT, COPIED)
     ]
-    if not isinstance(surrogate.net, ClosedFormFit):
+    if name != FIT:
         for batch in plan.batches:
             tasks.append((TRAINING, batch, partial(training_step, surrogate, dataset, batch)))
     for task, batch, build in tasks:
@@ -198,12 +197,13 @@ def measure(name: str, scene: Scene, samples: Sample, plan: Plan) -> Iterator[De
             torch.cuda.empty_cache()
 
 
-def fitted(net: nn.Module, scene: Scene, samples: Sample) -> Surrogate:
+def fitted(name: str, scene: Scene, samples: Sample) -> Surrogate:
     """Return the surrogate of a network whose bases or maps are fitted to samples."""
-    surrogate = Surrogate(net, MSE(), scene)
-    if isinstance(net, ClosedFormFit):
-        net.fit(samples, samples)
-    elif isinstance(net, TrainsInCoordinates):
+    network, base = NETWORKS[name]
+    surrogate = Surrogate.from_network(network, MSE(), scene, base=base)
+    if name == FIT:
+        cast(Unrolled, surrogate.net).fit(samples, samples)
+    elif surrogate.predictor.lacks_bases:
         surrogate.fit_bases(samples)
     return surrogate
 

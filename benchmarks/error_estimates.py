@@ -29,7 +29,7 @@ from dpl.fem import (
     solve,
 )
 from dpl.inference import Simulator
-from dpl.models import FCNN, ClosedFormFit, PODNet, Unrolled
+from dpl.models import FCNN, PODNet, Unrolled
 from dpl.training import MSE, Muon, RMSELoss, Surrogate, fit
 
 IN_RANGE, TWICE = "in range", "twice the range"
@@ -282,7 +282,7 @@ def trained(scene: Scene, data: DataModule, epochs: int) -> dict[str, Simulator]
     }
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
     for surrogate in surrogates.values():
-        if isinstance(surrogate.net, ClosedFormFit):
+        if surrogate.predictor.is_closed_form:
             fit(surrogate, data)
             continue
         trainer = L.Trainer(

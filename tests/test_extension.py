@@ -78,7 +78,7 @@ class Net(nn.Module):
         size = scene.problem.free.numel()
         self.layers = nn.Sequential(nn.Linear(size, width), nn.Tanh(), nn.Linear(width, size))
 
-    def forward(self, force):
+    def forward(self, force, scalars):
         return self.layers(force.flatten(1)).reshape(force.shape)
 
 

@@ -1,6 +1,7 @@
 """Follower loads with a range: each load has its own value, and all share one K(0)."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -221,14 +222,10 @@ def test_sizes_of_loads_do_not_depend_on_follower_loads(scene):
     assert scene.loads.sizes == pytest.approx(alone.loads.sizes, rel=1e-12)
 
 
-def test_models_without_an_input_for_it_are_refused_by_key(name, scene):
+def test_unrolled_refuses_it_by_name(name, scene):
     kind = {"air": "follower pressure", "muscle": "active stress"}[name]
     with pytest.raises(ValueError, match=f"has no {kind}"):
         Unrolled(scene, rank=4, cells=4, stages=1)
-    deaf = FCNN(scene, width=8)
-    deaf.extra_inputs = ()
-    with pytest.raises(ValueError, match=rf"forces\.{name}\.value is a range, .* has no input"):
-        Surrogate(deaf, MSE(), scene)
 
 
 def everywhere(points):
@@ -240,7 +237,8 @@ def test_the_energy_loss_has_the_equilibrium_as_its_minimum(one):
     """A closed surface has a potential, for all values of its range; a tension always has."""
     scene = scene_on(body(one))
     assert scene.problem.has_potential
-    surrogate = Surrogate(FCNN(scene, width=8, base="linear"), PotentialEnergyLoss(), scene)
+    network = partial(FCNN, width=8)
+    surrogate = Surrogate.from_network(network, PotentialEnergyLoss(), scene, base="linear")
     samples = scene.loads.sample(0, range(3))
     found = solve(scene.solver, samples)
     batch = Sample(samples.force, found.displacement, *samples[1:])
@@ -261,7 +259,7 @@ def test_data_network_and_simulator_take_the_value(name, scene, tmp_path):
     test = data.samples("test")
     low, high = KINDS[name][1]
     assert ((test.parameters >= low) & (test.parameters <= high)).all()
-    surrogate = Surrogate(FCNN(scene, width=8, base="linear"), MSE(), scene)
+    surrogate = Surrogate.from_network(partial(FCNN, width=8), MSE(), scene, base="linear")
     answer = Simulator(surrogate)(**scene.si_inputs(test.load), tol=1e-8)
     assert answer.converged.all()
     assert_close(answer.displacement / scene.length, test.displacement, rtol=0, atol=1e-8)

@@ -13,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import dpl
-from dpl import config, data, evaluation, models, training
+from dpl import config, data, evaluation, training
 from dpl.commands import cli
 from dpl.system.files import DataSetError
 
@@ -32,7 +32,7 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", "data.DataModule", "dpl.Surroga
             with config.error_in("ckpt_path", LookupError, TypeError, ValueError):
                 module.load_state_dict(resumed["DataModule"])
     trainer = config.build_trainer(cfg)
-    if not isinstance(surrogate.net, models.ClosedFormFit):
+    if not surrogate.predictor.is_closed_form:
         cli.check_trainer(trainer, cfg)
         if resumed is not None:
             config.check_callbacks(trainer, resumed)
@@ -42,7 +42,7 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", "data.DataModule", "dpl.Surroga
 def _check_data(surrogate: "dpl.Surrogate", source: "data.Source") -> None:
     """Raise a `ConfigError` if a model cannot be trained on samples of this source."""
     name = type(surrogate.net).__name__
-    if not isinstance(surrogate.net, models.ClosedFormFit):
+    if not surrogate.predictor.is_closed_form:
         if isinstance(source, data.Growing):
             raise config.ConfigError(
                 f"data=growing needs a model that is fitted, such as unrolled; {name} is trained "
@@ -84,7 +84,7 @@ def _train(cfg: DictConfig) -> float | None:
             config.save_config(cfg, folder)
     smallest: float | None = None
     try:
-        if isinstance(surrogate.net, models.ClosedFormFit):
+        if surrogate.predictor.is_closed_form:
             smallest = _fit(surrogate, module, trainer, folder)
         else:
             path = cfg.ckpt_path or None

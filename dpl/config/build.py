@@ -23,7 +23,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from torch import Tensor
 
-from dpl import training
+from dpl import models, training
 from dpl.config import validation
 from dpl.config.validation import ConfigError
 from dpl.fem import ParameterRange, Problem, SingularMatrix
@@ -279,11 +279,25 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "training.Surrogate":
     if cfg.scheduler:
         instantiate(cfg, "scheduler", optimizer=trial, total_steps=1)
     torch.manual_seed(cfg.seed)
-    parts = instantiate(cfg, "model", scene=scene), instantiate(cfg, "loss")
-    optimizer = instantiate(cfg, "optimizer")
-    scheduler = instantiate(cfg, "scheduler") if cfg.scheduler else None
+    options: dict[str, Any] = {
+        "optimizer": instantiate(cfg, "optimizer"),
+        "scheduler": instantiate(cfg, "scheduler") if cfg.scheduler else None,
+    }
+    net, predictor = _network(cfg, scene)
+    loss = instantiate(cfg, "loss")
     with error_in("model"):
-        return training.Surrogate(*parts, scene, optimizer=optimizer, scheduler=scheduler)
+        return training.Surrogate(net, loss, scene, **predictor, **options)
+
+
+def _network(cfg: DictConfig, scene: Scene) -> tuple[Any, dict[str, Any]]:
+    """Return the network of `model`, and those of its keys that are options of the surrogate."""
+    require_keys(cfg, "model")
+    node = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg.model, resolve=True))
+    predictor = {key: node.pop(key) for key in validation.PREDICTOR if key in node}
+    with error_in("model"):
+        inputs = models.Inputs.from_scene(scene, **predictor)
+    more = {"inputs": inputs} if "inputs" in validation.options_of(node) else {}
+    return instantiate(OmegaConf.create({"model": node}), "model", scene=scene, **more), predictor
 
 
 def build_trainer(cfg: DictConfig) -> "L.Trainer":

@@ -10,7 +10,7 @@ import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from dpl import models, training
+from dpl import training
 from dpl.config import validation
 from dpl.config.build import NOT_IDENTITY, error_in, instantiate, to_container
 from dpl.config.run_folder import (
@@ -169,7 +169,7 @@ def check_weights(
     """
     with error_in("ckpt_path", ValueError, TypeError, AttributeError):
         surrogate.on_load_checkpoint(checkpoint)
-    if isinstance(surrogate.net, models.ClosedFormFit):
+    if surrogate.predictor.is_closed_form:
         if grows:  # the sizes of its buffers are results of the fit
             return
         name = type(surrogate.net).__name__

@@ -107,6 +107,7 @@ VALUES = {  # type hints of values; others allow an object, which a call returns
     *(bool, int, float, str, types.NoneType, Path, Literal),
     *(Sequence, Iterable, list, tuple, Mapping, dict),
 }
+PREDICTOR = {"base": Literal["linear"] | None, "young": bool}  # of `Surrogate`, as keys of `model`
 HYDRA_KEYS = {"_target_", "_partial_", "_recursive_", "_convert_"}  # options of Hydra in a call
 
 
@@ -294,6 +295,8 @@ def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> 
         known, hints = _signature(target)
     except (TypeError, ValueError):  # a class or function in C
         raise ConfigError(f"{path}._target_ = {node['_target_']!r} has no known options") from None
+    if path == "model":
+        known, hints = known | set(PREDICTOR), hints | PREDICTOR
     for key, value in node.items():
         if key in HYDRA_KEYS:
             if key.endswith(("partial_", "recursive_")) and not isinstance(value, bool):

@@ -40,9 +40,9 @@ def write_folder(
         write_raw(folder / "reference" / f"{name}.f64", field)
     if isinstance(loads, HasModes):
         write_raw(folder / "modes.f64", loads.modal_forces.numpy())
-    scenery = {"scene": scene.fingerprint, "identity": scene.identity()}
     weights = folder / "weights.safetensors"
-    checkpoints.write({"state_dict": surrogate.state_dict(), **scenery}, weights)
+    entries = checkpoints.entries_of_scene(scene)
+    checkpoints.write({"state_dict": surrogate.state_dict(), **entries}, weights)
     lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in meta.items())
     with atomic_write(folder / "meta.json") as file:
         file.write(("{\n" + ",\n".join(lines) + "\n}\n").encode())

@@ -12,7 +12,6 @@ from dpl.export.onnx_graph import Array, ExportGraph, onnx_opset
 from dpl.fem import HasModes, Problem, evaluate_solution, solve, surface
 from dpl.fem.mesh.writing import flat_cells
 from dpl.fem.postprocess import triangles
-from dpl.models import ClosedFormFit
 from dpl.scene import Scene
 from dpl.training import Surrogate
 from dpl.version import __version__
@@ -24,15 +23,6 @@ RANGE = (
     "In range: max |q| <= 1 and |f - modes q| <= 1e-3 |f| at these nodes. "
     "Without a fit: |f| above `largest_force` is out of range."
 )
-SCALING = (
-    "input = force / (young force_unit scales.force); network; displacement = length "
-    "scales.displacement output, the prescribed displacement at fixed degrees of freedom"
-)
-SCALING_OF_BASE = (
-    "v = linear solution over length, a = rms(v) / scales.displacement; input = whitened v/rms(v) "
-    "and a; network; displacement = length (v + scales.displacement a^2 / (1 + a) output)"
-)
-SCALING_OF_FIT = "input = force / (young force_unit); model; displacement = length output"
 
 
 def describe(
@@ -106,16 +96,10 @@ def _scales(module: Surrogate) -> dict[str, Any]:
     return {
         "length": module.scene.length,
         "force_unit": module.scene.force_unit,
-        "force": float(module.force_scale),
-        "displacement": float(module.displacement_scale),
-        "meaning": _scaling(module),
+        "force": float(module.predictor.force_scale),
+        "displacement": float(module.predictor.displacement_scale),
+        "meaning": module.predictor.meaning,
     }
-
-
-def _scaling(module: Surrogate) -> str:
-    if module.base is not None:
-        return SCALING_OF_BASE
-    return SCALING_OF_FIT if isinstance(module.net, ClosedFormFit) else SCALING
 
 
 def _force_unit(scene: Scene) -> str:

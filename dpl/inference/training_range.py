@@ -55,6 +55,6 @@ class RangeCheck(NamedTuple):
 
 def _inputs(surrogate: Surrogate, load: Load) -> Sequence[tuple[Tensor, tuple[float, float]]]:
     """Return the moduli (B,) that are inputs of the network, each with its range."""
-    loads, takes = surrogate.scene.loads, getattr(surrogate.net, "extra_inputs", ())
+    loads = surrogate.scene.loads
     pairs = list(zip(load.parameters.unbind(1), loads.parameter_ranges.values(), strict=True))
-    return [*pairs, (load.young, loads.moduli)] if "young" in takes else pairs
+    return [*pairs, (load.young, loads.moduli)] if surrogate.predictor.reads_young else pairs

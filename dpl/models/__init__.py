@@ -1,6 +1,7 @@
-"""Networks: modules from scaled forces (B, N, D) to scaled displacements (B, N, D), float32.
+"""Networks: modules (field, scalars) -> scaled displacement, float32.
 
-Each is built from a scene and options of its own.
+Each is built from a scene, its inputs (`Inputs`) and options of its own. Fields have the shape
+(B, N, D), scalars (B, S).
 """
 
 from typing import TYPE_CHECKING
@@ -11,14 +12,14 @@ if TYPE_CHECKING:
     from dpl.models.cnn import CNN
     from dpl.models.fcnn import FCNN
     from dpl.models.gnn import GNN
+    from dpl.models.inputs import Inputs
     from dpl.models.linear_base import LinearBase
     from dpl.models.pod import PODNet
     from dpl.models.protocols import (
         ClosedFormFit,
         Correctable,
-        HasBase,
+        HasBases,
         HasCorrection,
-        TrainsInCoordinates,
     )
     from dpl.models.unrolled.model import Unrolled
 else:

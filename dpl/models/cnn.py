@@ -9,8 +9,7 @@ from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from dpl.fem import Problem
 from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
-from dpl.models.linear_base import Base
-from dpl.models.scalar_inputs import ScalarInputs
+from dpl.models.inputs import Inputs
 from dpl.scene import Scene
 from dpl.system.memory import refuse_beyond
 
@@ -40,18 +39,19 @@ class CNN(nn.Module):
     def __init__(
         self,
         scene: Scene,
+        inputs: Inputs | None = None,
         *,
         channels: int = 16,
         steps: int | None = None,
         grid: int | None = None,
         smooth: bool = False,
-        base: Base = "none",
         memory_limit: float | None = None,
     ) -> None:
         """Build the network.
 
         Args:
             scene: The scene to predict.
+            inputs: Its inputs; None for scaled forces.
             channels: Channels of the finest grid; each coarsening doubles them.
             steps: Number of coarsenings; None for as many as connect all points of the coarsest
                 grid.
@@ -60,11 +60,10 @@ class CNN(nn.Module):
                 many points as nodes.
             smooth: Leave out the residual blocks of the finest grid, which suits displacements
                 that vary little over an element.
-            base: "linear" for the nonlinear displacement as output, see `LinearBase`.
             memory_limit: Memory for training on one sample [GB]; None for that of the machine.
 
         Raises:
-            ValueError: `channels`, `steps` or `grid` is out of range, or there is no such base.
+            ValueError: `channels`, `steps` or `grid` is out of range.
             MemoryError: Parameters and one sample would not fit.
         """
         super().__init__()
@@ -72,9 +71,7 @@ class CNN(nn.Module):
             raise ValueError(f"channels = {channels} must be 1 or more")
         if grid is not None and grid < 2:
             raise ValueError(f"grid = {grid} must be 2 or more")
-        self.base = base
-        self.scalars = ScalarInputs(scene, base)
-        self.extra_inputs = self.scalars.names
+        inputs = inputs or Inputs.from_scene(scene)
         problem = scene.problem
         points, dim = problem.points, problem.shape[1]
         own = own_grid(points)
@@ -85,12 +82,13 @@ class CNN(nn.Module):
         self.immersion = Permutation(points, shape) if shape == own else Immersion(points, shape)
         constant = self._constant(problem, shape)
         self.register_buffer("constant", constant, persistent=False)
-        if base == "linear":  # displacements are averaged, forces summed
+        self.averages = inputs.is_displacement  # forces are summed
+        if self.averages:
             nodes = self.immersion.spread(torch.ones(1, len(points), 1))
             self.register_buffer("share", 1 / nodes.clamp(min=1e-6), persistent=False)
         self.smooth = smooth and len(sizes) > 1
-        inputs = dim + len(constant) + self.scalars.count
-        self.net = UNet(inputs, dim, sizes, widths, smooth=self.smooth)
+        channels_in = dim + len(constant) + inputs.scalars
+        self.net = UNet(channels_in, dim, sizes, widths, smooth=self.smooth)
 
     def _constant(self, problem: Problem, shape: tuple[int, ...]) -> Tensor:
         """Return the constant channels that are not uniform, (C, *shape)."""
@@ -106,28 +104,18 @@ class CNN(nn.Module):
         varying = [channel for channel in channels if channel.min() < channel.max()]
         return torch.stack(varying) if varying else share[:0]
 
-    def forward(
-        self, force: Tensor, parameters: Tensor | None = None, amplitude: Tensor | None = None
-    ) -> Tensor:
-        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
-
-        Args:
-            force: Scaled nodal forces, or scaled linear solutions with a linear base.
-            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
-            amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
-        """
-        constant = self.constant.expand(force.shape[0], *self.constant.shape)
-        fields = [self._on_grid(force), constant]
-        if self.scalars.count:
-            values = self.scalars(force, amplitude, parameters)
-            sides = fields[0].shape[2:]
-            fields.append(values.view(*values.shape, *[1] * len(sides)).expand(-1, -1, *sides))
-        return self.immersion.read(self.net(torch.cat(fields, 1)))
+    def forward(self, field: Tensor, scalars: Tensor) -> Tensor:
+        """Return the scaled displacement (B, N, D) of a field (B, N, D) and scalars (B, S)."""
+        on_grid = self._on_grid(field)
+        batch, sides = field.shape[0], on_grid.shape[2:]
+        uniform = scalars.view(*scalars.shape, *[1] * len(sides)).expand(-1, -1, *sides)
+        channels = [on_grid, self.constant.expand(batch, *self.constant.shape), uniform]
+        return self.immersion.read(self.net(torch.cat(channels, 1)))
 
     def _on_grid(self, field: Tensor) -> Tensor:
         """Return a nodal field (B, N, D) on the grid, (B, D, *shape)."""
         spread: Tensor = self.immersion.spread(field)
-        return spread * self.share if self.base == "linear" else spread
+        return spread * self.share if self.averages else spread
 
     def skipped_work(self) -> list[str]:
         """Return the work that the network saves, one line each."""

@@ -8,9 +8,8 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from dpl.models.graph import Graph, Integers, hierarchy, means
-from dpl.models.linear_base import Base
+from dpl.models.inputs import Inputs
 from dpl.models.message_passing import Level, Messages
-from dpl.models.scalar_inputs import ScalarInputs
 from dpl.models.stored_buffers import StoredBuffers, check_indices
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
@@ -38,25 +37,25 @@ class GNN(nn.Module):
     def __init__(
         self,
         scene: Scene,
+        inputs: Inputs | None = None,
         *,
         width: int = 32,
         levels: int | None = None,
         passes: int = 1,
-        base: Base = "none",
     ) -> None:
         """Build the network.
 
         Args:
             scene: The scene to predict.
+            inputs: Its inputs; None for scaled forces.
             width: Channels of the nodes; each coarser level has twice as many, at most
                 `MAX_WIDTH_RATIO` times `width`.
             levels: Number of levels with that of the nodes; 1 for messages between neighbouring
                 nodes only; None for clusters that are twice as wide from level to level.
             passes: Number of V-cycles.
-            base: "linear" for the nonlinear displacement as output, see `LinearBase`.
 
         Raises:
-            ValueError: `width`, `levels` or `passes` is out of range, or there is no such base.
+            ValueError: `width`, `levels` or `passes` is out of range.
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
@@ -66,9 +65,7 @@ class GNN(nn.Module):
             raise ValueError(f"levels = {levels} must be 1 or more")
         if not 1 <= passes <= MAX_PASSES:
             raise ValueError(f"passes = {passes} must be 1 or more and at most {MAX_PASSES}")
-        self.base = base
-        self.scalars = ScalarInputs(scene, base)
-        self.extra_inputs = self.scalars.names
+        inputs = inputs or Inputs.from_scene(scene)
         problem = scene.problem
         nodes, dim = problem.shape
         graphs, clusters = hierarchy(problem, levels)
@@ -79,7 +76,7 @@ class GNN(nn.Module):
         flags = np.column_stack([problem.free.numpy(), problem.boundary.numpy()]).astype(float)
         self.levels = nn.ModuleList()
         for k, graph in enumerate(graphs):
-            kind = {"first": k == 0, "averages": base == "linear"}
+            kind = {"first": k == 0, "averages": inputs.is_displacement}
             self.levels.append(Level(graph, flags, nodes, widths[k], **kind))
             if k < len(clusters):
                 flags = means(flags, clusters[k])
@@ -89,29 +86,20 @@ class GNN(nn.Module):
         )
         self.sizes = [len(graph.points) for graph in graphs]
         self.complete = graphs[-1].complete
-        self.moduli = nn.ModuleList(
-            nn.Linear(self.scalars.count, wide) for wide in widths if self.scalars.count
+        self.scalars = nn.ModuleList(
+            nn.Linear(inputs.scalars, wide) for wide in widths if inputs.scalars
         )
         self.passes = nn.ModuleList(Pass(dim, widths) for _ in range(passes))
         self.decode = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, dim))
 
-    def forward(
-        self, force: Tensor, parameters: Tensor | None = None, amplitude: Tensor | None = None
-    ) -> Tensor:
-        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
-
-        Args:
-            force: Scaled nodal forces, or scaled linear solutions with a linear base.
-            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
-            amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
-        """
+    def forward(self, field: Tensor, scalars: Tensor) -> Tensor:
+        """Return the scaled displacement (B, N, D) of a field (B, N, D) and scalars (B, S)."""
         states = [
-            level(*load) for level, load in zip(self.levels, self.resultants(force), strict=True)
+            level(*load) for level, load in zip(self.levels, self.resultants(field), strict=True)
         ]
-        if self.scalars.count:
-            values = self.scalars(force, amplitude, parameters)
-            pairs = zip(states, self.moduli, strict=True)
-            states = [state + encoder(values)[None] for state, encoder in pairs]
+        if len(self.scalars) or scalars.shape[1]:  # both, or an error
+            pairs = zip(states, self.scalars, strict=True)
+            states = [state + encoder(scalars)[None] for state, encoder in pairs]
         for v_cycle in self.passes:
             states = v_cycle(states, self.levels, self.steps)
         return self.decode(states[0]).transpose(0, 1)

@@ -1,7 +1,6 @@
 """The linear solution as the base of a prediction: networks learn the nonlinear displacement."""
 
 from functools import cached_property
-from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,29 +12,8 @@ from dpl.models.linear_response import LinearResponse
 from dpl.models.whitening import FieldWhitening
 from dpl.scene import Scene
 
-Base = Literal["none", "linear"]
-BASES = ("none", "linear")
 SCALE_STREAM = 3  # random stream of the loads for scales; samples use smaller numbers
 SCALE_LOADS = 256
-
-
-def check_base(base: str) -> None:
-    """Raise ValueError if `base` is not the name of a base."""
-    if base not in BASES:
-        raise ValueError(f"base = {base} must be one of {', '.join(BASES)}")
-
-
-class ScaledLinearSolution(NamedTuple):
-    """A linear solution as input of a network.
-
-    Attributes:
-        field: Linear solution over its root mean square, (B, N, D) [-], float64.
-        amplitude: Root mean square of the linear solution over free degrees of freedom, in units of
-            the displacement scale, (B,) [-], float64.
-    """
-
-    field: Tensor
-    amplitude: Tensor
 
 
 class LinearBase:
@@ -72,7 +50,7 @@ class LinearBase:
         StiffnessIteration.of_terms(StiffnessTerms.of(scene.problem))  # may raise
         if linear is None:
             linear = sampled_solutions(scene)[1]
-        fields = self.scale_inputs(linear, linear.new_ones(())).field
+        fields, _ = self.scale_inputs(linear, linear.new_ones(()))
         self.whiten = FieldWhitening(fields, scene.problem.free)
 
     @cached_property
@@ -90,12 +68,12 @@ class LinearBase:
         dofs = free.flatten().nonzero()[:, 0]
         return prescribed.index_copy(1, dofs, values).view_as(force)
 
-    def scale_inputs(self, linear: Tensor, scale: Tensor) -> ScaledLinearSolution:
-        """Return the inputs of a network, with the field before it is whitened.
+    def scale_inputs(self, linear: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+        """Return v / rms(v), (B, N, D), and amplitudes a, (B,), float64.
 
         Args:
-            linear: Linear solutions, (B, N, D) [-].
-            scale: Displacement scale, () [-].
+            linear: Linear solutions v, (B, N, D) [-].
+            scale: Displacement scale s, () [-].
         """
         linear = linear.double()
         free = self._problem.free.to(linear.device)  # no index: a GPU would wait for its size
@@ -103,7 +81,7 @@ class LinearBase:
         size = torch.where(square > 0, square, 1.0).sqrt()  # the root has no gradient at zero
         size = torch.where(square > 0, size, 0.0)
         field = linear / torch.where(square > 0, size, 1.0)[:, None, None]
-        return ScaledLinearSolution(field, size / scale)
+        return field, size / scale
 
     def scale_outputs(self, nonlinear: Tensor, amplitude: Tensor, scale: Tensor) -> Tensor:
         """Return the outputs of a network, (B, N, D), that give nonlinear displacements.

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         ResidualRatio,
     )
     from dpl.training.muon import Muon
+    from dpl.training.predictors import Fitted, OnLinearSolution, Predictor, Scaled
     from dpl.training.schedules import warmup_cosine
     from dpl.training.surrogate import Surrogate
 else:

@@ -22,6 +22,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from safetensors import safe_open
 from safetensors.torch import save
 
+from dpl.scene import Scene
 from dpl.system.files import atomic_write
 
 WEIGHTS = ".safetensors"
@@ -77,6 +78,23 @@ def read(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict) or not isinstance(found.get("state_dict"), dict):
         raise ValueError("is not a checkpoint: it contains no weights")
     return found
+
+
+def entries_of_scene(scene: Scene) -> dict[str, Any]:
+    """Return the entries of a checkpoint by which `check_scene` recognises its scene."""
+    nodes = scene.problem.shape[0]
+    return {"scene": scene.fingerprint, "identity": scene.identity(), "nodes": nodes}
+
+
+def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
+    """Raise ValueError if a checkpoint belongs to another scene."""
+    stored, identity = checkpoint.get("scene", "unknown"), checkpoint.get("identity", {})
+    if stored == scene.fingerprint or scene.matches(identity):
+        return
+    lines = "".join(f"; {line}" for line in scene.differences(identity))
+    raise ValueError(
+        f"the checkpoint is of scene {stored[:12]}, this scene is {scene.fingerprint[:12]}{lines}"
+    )
 
 
 def epochs(checkpoint: Mapping[str, Any]) -> int:

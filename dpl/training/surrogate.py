@@ -1,4 +1,4 @@
-"""The LightningModule: a network with scales, loss, metrics and optimiser."""
+"""The LightningModule: a predictor with loss, metrics and optimiser."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Self, cast
@@ -6,37 +6,32 @@ from typing import Any, Self, cast
 import lightning as L
 import torch
 from torch import Tensor, nn
+from torch.utils.data import Dataset
 
 from dpl.fem import Load
 from dpl.fem.symmetry import Symmetry
-from dpl.models.linear_base import SCALE_STREAM, LinearBase, check_base, sampled_solutions
-from dpl.models.protocols import ClosedFormFit, HasBase, TrainsInCoordinates
-from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
+from dpl.models.inputs import Base, Inputs
+from dpl.models.linear_base import SCALE_STREAM
 from dpl.scene import Sample, Scene
+from dpl.training import checkpoints
 from dpl.training.callbacks.averaged_weights import AveragedWeights
-from dpl.training.linear_samples import LinearBatch, LinearSamples, linear_solutions
 from dpl.training.losses.loss import Loss, LossContext
-from dpl.training.losses.supervised import SquaredErrorLoss
 from dpl.training.metrics import default_metrics
+from dpl.training.predictors import predictor_of
 from dpl.training.random_states import random_states, set_random_states
 from dpl.training.schedules import step_in_time, time_fraction, total_steps
-
-SCALES = ("force_scale", "displacement_scale", "largest_force")
 
 
 class Surrogate(L.LightningModule):
     """A network that predicts the displacement in equilibrium with a load.
 
-    `predict` is the only border between float64 mechanics and the float32 network. `forward` takes
-    newtons and pascals and returns metres.
+    `forward` takes newtons and pascals and returns metres; `predict` is dimensionless.
 
     Attributes:
-        net: Module from scaled forces (B, N, D) to scaled displacements (B, N, D). Its optional
-            attribute `extra_inputs` names further inputs: "young", "parameters", and with a
-            linear base "amplitude".
-        base: The linear solutions that the output of the network is added to; None without.
+        predictor: The network with its scales, perhaps on the linear solution, see `Predictor`.
         scene: The scene.
         loss: The loss.
+        physics: The part of the scene that losses need, on the device of the network.
     """
 
     def __init__(
@@ -45,15 +40,22 @@ class Surrogate(L.LightningModule):
         loss: Loss,
         scene: Scene,
         *,
+        base: Base | None = None,
+        young: bool = False,
         optimizer: Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer] = torch.optim.AdamW,
         scheduler: Callable[..., Any] | None = None,
     ) -> None:
         """Combine a network, a loss and a scene.
 
         Args:
-            net: The network, see the class.
+            net: Module from a field (B, N, D) and scalars (B, S) to a scaled displacement
+                (B, N, D), float32; built for `Inputs.from_scene(scene, base, young=young)`. Or a
+                model that `ClosedFormFit` describes.
             loss: The loss.
             scene: The scene.
+            base: "linear": the network adds to the linear solution, see `OnLinearSolution`; None:
+                it predicts the displacement from the force, see `Scaled`.
+            young: Young's modulus is an input of the network, see `Scaled`.
             optimizer: Function of the parameters that returns an optimiser.
             scheduler: Function of an optimiser and `total_steps` that returns a learning-rate
                 schedule, stepped every batch; None for a constant learning rate. With a time limit
@@ -61,35 +63,39 @@ class Surrogate(L.LightningModule):
                 of the time).
 
         Raises:
-            ValueError: The body has ranges and the network no input for parameters, or the network
-                has a base that does not exist or that its training excludes.
+            ValueError: There is no such base, or it excludes the network or another option.
         """
         super().__init__()
-        self.net, self.loss, self.scene = net, loss, scene
-        self._is_closed_form = isinstance(net, ClosedFormFit)
-        self._has_coordinates = isinstance(net, TrainsInCoordinates)
+        self.predictor = predictor_of(net, scene, base, young=young)
+        self.loss, self.scene = loss, scene
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
-        stresses = scene.problem.follower_loads.ranges
-        for name, ends in scene.loads.parameter_ranges.items():
-            if "parameters" not in getattr(net, "extra_inputs", ()):
-                key = f"forces.{name}.value" if name in stresses else f"material.{name}"
-                raise ValueError(
-                    f"{key} is a range, {list(ends)}, and {type(net).__name__} has no input for "
-                    f"it; set {key} to a number or choose another model"
-                )
+        self.largest_force: Tensor
         largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
-        self.base, factors = None, torch.ones(2).double().unbind()
-        adds_to_base = _adds_to_base(net)
-        if not self._is_closed_form:
-            force, linear = sampled_solutions(scene)
-            self.base = LinearBase(scene, linear) if adds_to_base else None
-            factors = scales(scene, force, linear)
-        for name, value in zip(SCALES, (*factors, largest_force), strict=True):
-            self.register_buffer(name, value.clone())
+        self.register_buffer("largest_force", largest_force)
         self.physics = LossContext(scene.problem, self.largest_force)
         self.val_metrics = default_metrics(scene.problem).clone(prefix="val/")
         self.test_metrics = default_metrics(scene.problem).clone(prefix="test/")
+
+    @classmethod
+    def from_network(
+        cls,
+        network: Callable[..., nn.Module],
+        loss: Loss,
+        scene: Scene,
+        *,
+        base: Base | None = None,
+        young: bool = False,
+        **options: Any,
+    ) -> Self:
+        """Return a surrogate with `network(scene, inputs)`; the options are those of the class."""
+        net = network(scene, Inputs.from_scene(scene, base, young=young))
+        return cls(net, loss, scene, base=base, young=young, **options)
+
+    @property
+    def net(self) -> nn.Module:
+        """The network."""
+        return self.predictor.net
 
     def forward(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return displacements (B, N, D) [m] under nodal forces (B, N, D) [N].
@@ -101,157 +107,27 @@ class Surrogate(L.LightningModule):
         """
         return self.scene.length * self.predict(self.scene.load_of(force, young, parameters))
 
-    def predict(self, load: Load, linear: Tensor | None = None) -> Tensor:
-        """Return displacements over L, (B, N, D) [-], float64.
-
-        Args:
-            load: The loads.
-            linear: Their linear solutions, (B, N, D) [-], if they are known; used with a base only.
-        """
-        if self.base is not None:
-            return self._predict_from_base(
-                self.base, load, self.base.solve(load) if linear is None else linear.double()
-            )
-        scaled, more = self.scale_inputs(load)
-        return self.unscale_outputs(self.net(scaled, **more))
-
-    def _predict_from_base(self, base: LinearBase, load: Load, linear: Tensor) -> Tensor:
-        """Return displacements over L, (B, N, D) [-], of a network with a linear base."""
-        field, amplitude = base.scale_inputs(linear, self.displacement_scale)
-        more = self._extra_inputs(load, amplitude=amplitude)
-        field = field.to(self.dtype)
-        if not self._has_coordinates:  # a network with coordinates whitens these
-            field = base.whiten(field)
-        output = self.net(field, **more).double() * self.displacement_scale
-        nonlinear = base.gate(amplitude)[:, None, None] * output
-        return linear + torch.where(self.physics.problem.free, nonlinear, 0.0)
-
-    def scale_inputs(self, load: Load) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the inputs of the network: scaled forces (B, N, D), and its extra inputs by name.
-
-        Networks with a linear base have other inputs.
-
-        Raises:
-            ValueError: The load has not one parameter for each range of the body.
-        """
-        scaled = load.force
-        if not self._is_closed_form:
-            scaled = (self._effective_force(scaled) / self.force_scale).to(self.dtype)
-        return scaled, self._extra_inputs(load)
-
-    def _extra_inputs(self, load: Load, **computed: Tensor) -> dict[str, Tensor]:
-        if load.parameters.shape[-1] != len(names := list(self.scene.loads.parameter_ranges)):
-            found = load.parameters.shape[-1]
-            raise ValueError(f"Load.parameters has {found} columns; the body has ranges of {names}")
-        known = {"young": load.young, "parameters": load.parameters} | computed
-        return {name: known[name] for name in getattr(self.net, "extra_inputs", ())}
-
-    def _effective_force(self, force: Tensor) -> Tensor:
-        """Return forces (B, N, D) with the values of training on fixed degrees of freedom."""
-        problem, constant = self.physics.problem, self.scene.loads.constant_force
-        force = problem.acting(force)
-        if constant is None:
-            return force
-        return force + torch.where(problem.free, 0.0, constant.to(force.device))
-
-    def unscale_outputs(self, output: Tensor) -> Tensor:
-        """Return displacements over L (B, N, D) [-], float64, from outputs of the network."""
-        if self._is_closed_form:
-            return output
-        problem, displacement = self.physics.problem, output.double() * self.displacement_scale
-        return torch.where(problem.free, displacement, problem.prescribed)
+    def predict(self, load: Load) -> Tensor:
+        """Return displacements over L, (B, N, D) [-], float64."""
+        return cast(Tensor, self.predictor(load))
 
     def describe(self) -> list[tuple[str, str]]:
         """Return name and size of the network, and the loss."""
-        kind = type(self.net).__name__
-        if self._is_closed_form:
-            return [("model", f"{kind}, fitted by linear regression")]
-        count = sum(weights.numel() for weights in self.net.parameters())
-        return [("model", f"{kind}, {count:,} weights; loss {type(self.loss).__name__}")]
+        return [("model", self.predictor.describe(self.loss))]
 
     def skipped_work(self) -> list[str]:
         """Return the work that network and loss save, one line each."""
-        lines = [*getattr(self.net, "skipped_work", list)(), *self.loss.skipped_work()]
-        if self.base is not None:
-            lines.append("no learning of linear elasticity: the network adds to K(0)^-1 f")
-        if self._trains_in_coordinates:
-            lines.append("no fields in training from disk: the loss is computed in coordinates")
-        return lines
+        return [*self.predictor.skipped_work(), *self.loss.skipped_work()]
 
-    @property
-    def _trains_in_coordinates(self) -> bool:
-        return self._has_coordinates and isinstance(self.loss, SquaredErrorLoss)
+    def encode(self, samples: Sample, group: Sequence[Symmetry] = ()) -> Dataset:
+        """Return what the network is trained on, see `Predictor.dataset`."""
+        return self.predictor.dataset(samples, group)
 
-    def training_step(self, batch: Sample | LinearBatch | ReducedSamples, batch_idx: int) -> Tensor:
+    def training_step(self, batch: Any, batch_idx: int) -> Tensor:
         """Return the loss of a batch, ()."""
-        if isinstance(batch, ReducedSamples):
-            loss = self._reduced_loss(batch)
-        else:
-            linear, sample = batch if isinstance(batch, LinearBatch) else (None, batch)
-            prediction = self.predict(sample.load, linear)
-            loss = self.loss(prediction, sample, self.physics)
+        loss = self.predictor.loss(batch, self.loss, self.physics)
         self.log("loss/train", loss, prog_bar=True, batch_size=len(batch[0]))
         return loss
-
-    def _reduced_loss(self, batch: ReducedSamples) -> Tensor:
-        """Return the loss of a batch in reduced coordinates, ()."""
-        net = cast(TrainsInCoordinates, self.net)
-        error = (net.network(batch.inputs) - batch.targets).square().sum(dim=1)
-        square = self.displacement_scale**2
-        error = square * batch.factor.square() * (error + batch.squared_error)
-        error = error / self.scene.problem.free.numel()
-        loss = cast(SquaredErrorLoss, self.loss)
-        return loss.from_squared_errors(error, square * batch.mean_square)
-
-    def encode(
-        self, samples: Sample, group: Sequence[Symmetry] = ()
-    ) -> ReducedDataset | LinearSamples | None:
-        """Return training samples (S, N, D) in reduced coordinates or with their linear solutions.
-
-        In an orthonormal basis the squared error of a displacement is the squared error of its
-        coordinates plus the squared projection error. A loss that is a function of squared errors
-        therefore needs no fields.
-
-        Returns None if the network or the loss needs fields and no linear solutions, or if images
-        of the samples are wanted and the network does not compute them.
-
-        Args:
-            samples: The samples.
-            group: Symmetries of the body whose images of samples are wanted; empty for none.
-        """
-        net = cast(TrainsInCoordinates, self.net)
-        if self._trains_in_coordinates and (len(group) < 2 or net.is_symmetric):
-            return self._encode_in_coordinates(net, samples)
-        return None if self.base is None else LinearSamples(samples, self.base, group)
-
-    def _encode_in_coordinates(self, net: TrainsInCoordinates, samples: Sample) -> ReducedDataset:
-        scaled, amplitude = self._scale(samples)
-        if self.base is None:
-            return net.encode(scaled)
-        data = net.encode(scaled, amplitude)
-        whole = samples.displacement / self.displacement_scale.cpu()
-        images = len(data) // len(whole)
-        data.samples = data.samples._replace(
-            mean_square=whole.square().flatten(1).mean(dim=1).repeat(images),
-            factor=self.base.gate(amplitude).repeat(images),
-        )
-        return data
-
-    def _scale(self, samples: Sample) -> tuple[Sample, Tensor]:
-        """Return samples (S, N, D) as a network of coordinates sees them, and amplitudes (S,)."""
-        size = self.displacement_scale.cpu()
-        if self.base is None:
-            force = samples.force / self.force_scale.cpu()
-            scaled = samples._replace(force=force, displacement=samples.displacement / size)
-            return scaled, torch.ones_like(samples.young)
-        linear = linear_solutions(samples.load, self.base).double()
-        field, amplitude = self.base.scale_inputs(linear, size)
-        wanted = self.base.scale_outputs(samples.displacement - linear, amplitude, size)
-        return samples._replace(force=field, displacement=wanted), amplitude
-
-    def fit_bases(self, samples: Sample) -> None:
-        """Fit the bases of the network to training samples (S, N, D)."""
-        cast(TrainsInCoordinates, self.net).fit_bases(self._scale(samples)[0])
 
     def validation_step(self, batch: Sample, batch_idx: int) -> None:
         """Update the validation metrics."""
@@ -268,10 +144,13 @@ class Surrogate(L.LightningModule):
 
     def setup(self, stage: str) -> None:
         """Fit the bases of the network."""
-        # before later hooks: schedules load the batches, and encoding them takes the bases
-        net = cast(TrainsInCoordinates, self.net)
-        if stage == "fit" and self._has_coordinates and not net.is_fitted:
-            self.fit_bases(self.trainer.datamodule.snapshots())
+        if stage == "fit" and self.predictor.lacks_bases:
+            data = self.trainer.datamodule
+            self.fit_bases(data.snapshots(), data.group)
+
+    def fit_bases(self, samples: Sample, group: Sequence[Symmetry] = ()) -> None:
+        """Fit the bases of a network that `HasBases` to samples (S, N, D) and their images."""
+        self.predictor.fit_bases(samples, group)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move the module, and the problem of the loss and of the metrics to the same device.
@@ -279,10 +158,7 @@ class Surrogate(L.LightningModule):
         All ways to move a module end here. Lightning moves it after the hook `setup`.
         """
         super()._apply(fn, recurse)
-        device, problem = self.largest_force.device, self.physics.problem
-        if problem.points.device != device:
-            own = self.scene.problem
-            problem = own if own.points.device == device else own.to(device)
+        problem = self.predictor.problem
         self.physics = LossContext(problem, self.largest_force)
         for collection in (self.val_metrics, self.test_metrics):
             for metric in collection.values():
@@ -309,7 +185,7 @@ class Surrogate(L.LightningModule):
         Raises:
             TypeError: The network is fitted in closed form.
         """
-        if self._is_closed_form:
+        if self.predictor.is_closed_form:
             name = type(self.net).__name__
             raise TypeError(f"{name} has no gradient descent; call dpl.training.fit")
         optimizer = self._optimizer(self.parameters())
@@ -329,12 +205,7 @@ class Surrogate(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the scene, the states of random number generators and averaged weights."""
-        checkpoint |= {
-            "scene": self.scene.fingerprint,
-            "identity": self.scene.identity(),
-            "nodes": self.scene.problem.shape[0],
-            "random": random_states(),
-        }
+        checkpoint |= checkpoints.entries_of_scene(self.scene) | {"random": random_states()}
         # not a hook of the callback: Lightning calls those only for complete checkpoints
         for callback in self._trainer.callbacks if self._trainer else ():
             if isinstance(callback, AveragedWeights):
@@ -346,13 +217,7 @@ class Surrogate(L.LightningModule):
         Raises:
             ValueError: The checkpoint belongs to another scene.
         """
-        stored, identity = checkpoint.get("scene", "unknown"), checkpoint.get("identity", {})
-        if stored != self.scene.fingerprint and not self.scene.matches(identity):
-            raise ValueError(
-                f"the checkpoint is of scene {stored[:12]}, this scene is "
-                f"{self.scene.fingerprint[:12]}"
-                + "".join(f"; {line}" for line in self.scene.differences(identity))
-            )
+        checkpoints.check_scene(checkpoint, self.scene)
         self._random_states = checkpoint.get("random")
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
@@ -363,6 +228,8 @@ class Surrogate(L.LightningModule):
             RuntimeError: The weights are of another network.
         """
         own = self.state_dict()
+        if "force_scale" in state_dict:
+            raise ValueError("was written by an earlier version of dpl; train the run again")
         for name, stored in state_dict.items():
             dtype = own[name].dtype if name in own else stored.dtype
             if stored.dtype != dtype and not stored.is_floating_point() & dtype.is_floating_point:
@@ -370,9 +237,8 @@ class Surrogate(L.LightningModule):
             if not stored.to(dtype).isfinite().all():
                 raise ValueError(f"{name} must be finite")
         found = super().load_state_dict(state_dict, *args, **options)
-        for name in SCALES:
-            if not (value := getattr(self, name)) > 0:
-                raise ValueError(f"{name} = {float(value)} must be above 0")
+        if not self.largest_force > 0:
+            raise ValueError(f"largest_force = {float(self.largest_force)} must be above 0")
         return found
 
     def check_predictions(self) -> None:
@@ -386,33 +252,3 @@ class Surrogate(L.LightningModule):
         """Restore the states of random number generators of a resumed run."""
         if self._random_states is not None:
             set_random_states(self._random_states)
-
-
-def _adds_to_base(net: nn.Module) -> bool:
-    """Return True if the output of a network is added to linear solutions.
-
-    Raises:
-        ValueError: There is no such base, or the network is not trained by gradient descent.
-    """
-    if not isinstance(net, HasBase) or net.base == "none":
-        return False
-    check_base(net.base)
-    if isinstance(net, ClosedFormFit):
-        raise ValueError(f"{type(net).__name__} requires base = none, not {net.base}")
-    return True
-
-
-def scales(scene: Scene, force: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the scales of forces and displacements, scalars [-].
-
-    They are root mean squares: of forces over loadable degrees of freedom, of displacements over
-    free degrees of freedom.
-
-    Args:
-        scene: The scene.
-        force: Forces of random loads, (S, N, D) [-].
-        displacement: Their linear solutions, (S, N, D) [-].
-    """
-    force = force[:, scene.loads.loadable_dofs]
-    displacement = displacement[:, scene.problem.free]
-    return force.square().mean().sqrt(), displacement.square().mean().sqrt()

@@ -33,8 +33,8 @@ def test_every_network_is_measured_at_every_batch(name, scene, samples):
 
 def test_a_timed_training_step_lowers_the_loss(scene, samples):
     torch.manual_seed(0)
-    surrogate = devices.fitted(devices.NETWORKS["fcnn"](scene), scene, samples)
-    step = devices.training_step(surrogate, devices.Samples(samples), 12)
+    surrogate = devices.fitted("fcnn", scene, samples)
+    step = devices.training_step(surrogate, surrogate.encode(samples), 12)
     first = step()
     for _ in range(20):
         last = step()
@@ -42,7 +42,7 @@ def test_a_timed_training_step_lowers_the_loss(scene, samples):
 
 
 def test_a_timed_prediction_is_that_of_the_surrogate_with_repeated_loads(scene, samples):
-    surrogate = devices.fitted(devices.NETWORKS["cnn linear"](scene), scene, samples)
+    surrogate = devices.fitted("cnn linear", scene, samples)
     predict = devices.prediction(surrogate, samples, 30, copies=True)
     with torch.inference_mode():
         expected = surrogate.predict(samples.load)
@@ -63,10 +63,10 @@ def test_calls_end_after_the_number_or_the_time():
 
 
 def test_a_network_beyond_the_memory_is_named_and_left_out(scene, samples, monkeypatch):
-    def build(scene):
+    def build(scene, inputs):
         raise MemoryError("2 parameters need 9 GB, there are 8 GB")
 
-    monkeypatch.setitem(devices.NETWORKS, "fcnn", build)
+    monkeypatch.setitem(devices.NETWORKS, "fcnn", (build, None))
     assert list(devices.measure("fcnn", scene, samples, QUICK)) == [
         "fcnn: 2 parameters need 9 GB, there are 8 GB"
     ]

@@ -53,7 +53,7 @@ NONSENSE = {  # command line -> what the one line says
     "train -m model=fcnn,fcn": r"^model = fcn: there is no such option",
     "train -m data.train=8,0": r"^data\.train = 0 must lie between",
     "train -m seed=0,1 optimizer.lr=1e-3,1e30": r"^optimizer\.lr = 1e\+30 must lie between",
-    "train model.base=quadratic": r"^model\.base = 'quadratic' must be one of none, linear",
+    "train model.base=quadratic": r"^model\.base = 'quadratic' must be one of linear or null",
     "train -m model.layers=2,1": r"^model: layers = 1 must be 2 or more",
     "train -m loss=lr_plus loss.weight=1,-1": r"^loss: weight = -1",
     "train -m fixed.axis=0,3": r"^fixed: axis = 3",

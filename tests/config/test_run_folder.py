@@ -695,11 +695,27 @@ def test_a_configuration_that_no_run_writes_is_refused_by_name(copied, text, rep
 @pytest.mark.parametrize(
     ("name", "change", "reported"),
     [
-        ("net.stages.0.weight", lambda w: w[1:], r"size mismatch for net\.stages\.0\.weight"),
-        ("net.stages.0.weight", lambda w: w.long(), r"net\.stages\.0\.weight of torch\.int64 must"),
-        ("net.stages.0.weight", lambda w: w / 0, r"net\.stages\.0\.weight must be finite"),
-        ("net.stages.0.weight", lambda w: w + 1e38, "the answers of the network are not finite"),
-        ("force_scale", lambda w: -w, r"force_scale = -\S+ must be above 0"),
+        (
+            "predictor.net.stages.0.weight",
+            lambda w: w[1:],
+            r"size mismatch for predictor\.net\.stages\.0\.weight",
+        ),
+        (
+            "predictor.net.stages.0.weight",
+            lambda w: w.long(),
+            r"net\.stages\.0\.weight of torch\.int64 must",
+        ),
+        (
+            "predictor.net.stages.0.weight",
+            lambda w: w / 0,
+            r"net\.stages\.0\.weight must be finite",
+        ),
+        (
+            "predictor.net.stages.0.weight",
+            lambda w: w + 1e38,
+            "the answers of the network are not finite",
+        ),
+        ("predictor.force_scale", lambda w: -w, r"force_scale = -\S+ must be above 0"),
     ],
 )
 def test_damaged_weights_are_refused_by_name(copied, name, change, reported):

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +50,12 @@ CONSUMERS = Path(__file__).parents[2] / "docs" / "consumers"
 def make_surrogate(make, scene, seed=0, **options):
     """Return a surrogate with random weights, and with bases fitted to a few solved loads."""
     torch.manual_seed(seed)
-    surrogate = Surrogate(make(scene, **options), MSE(), scene)
-    if isinstance(surrogate.net, PODNet):
+    inputs = {key: options.pop(key) for key in ("base", "young") if key in options}
+    network = (
+        partial(make, **options) if make is not Unrolled else lambda *_: make(scene, **options)
+    )
+    surrogate = Surrogate.from_network(network, MSE(), scene, **inputs)
+    if surrogate.predictor.lacks_bases:
         load = scene.loads.sample((0, 1), range(8))
         truth = solve(scene.solver, load).displacement
         surrogate.fit_bases(Sample(load.force, truth, load.young, load.parameters))
@@ -206,18 +211,18 @@ def test_a_graph_with_other_weights_is_detected(make_graph):
 class ValueDependent(nn.Module):
     """Network with control flow that depends on the values of a load."""
 
-    def __init__(self, scene):
+    def __init__(self, scene, inputs):
         super().__init__()
         self.scale = nn.Parameter(torch.ones(1))
 
-    def forward(self, force):
+    def forward(self, force, scalars):
         return self.scale * (force if bool(force.sum() > 0) else -force)
 
 
 class FixedBatch(ValueDependent):
     """Network whose graph has the batch size of the example inputs."""
 
-    def forward(self, force):
+    def forward(self, force, scalars):
         return self.scale * torch.cat([force[k : k + 1] for k in range(len(force))])
 
 

@@ -368,8 +368,8 @@ def test_a_network_is_not_told_of_forces_on_held_nodes(make_scene, network):
         held = load._replace(force=torch.where(scene.problem.free, load.force, 7.0))
         with torch.no_grad():
             assert torch.equal(surrogate.predict(held), surrogate.predict(load))
-            scaled, _ = surrogate.scale_inputs(load)
-        assert torch.equal(scaled, (load.force / surrogate.force_scale).float())
+            scaled, _ = surrogate.predictor.examples(dpl.Sample(load.force, load.force, load.young))
+        assert torch.equal(scaled, load.force / surrogate.predictor.force_scale)
 
 
 @pytest.mark.parametrize("size", [1e-100, 1e-158, 1e-200, 1e-280])

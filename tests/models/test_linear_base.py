@@ -1,51 +1,44 @@
 """Networks that learn the nonlinear displacement: base = linear."""
 
+from functools import partial
+
 import pytest
 import torch
 
 import dpl
-from dpl.fem import (
-    Load,
-    rectangle,
-    solve,
-    symmetries,
-)
-from dpl.fem.symmetry import images
-from dpl.models import CNN, FCNN, GNN, LinearBase, PODNet, Unrolled
-from dpl.models.reduced_samples import ReducedDataset
-from dpl.training import MSE, RMSELoss, Surrogate
+from dpl.fem import Load, rectangle, solve, symmetries
+from dpl.models import CNN, FCNN, GNN, Inputs, LinearBase, Unrolled
+from dpl.training import MSE, OnLinearSolution, RMSELoss, Scaled, Surrogate
 from dpl.training.linear_samples import LinearBatch, LinearSamples
-
-NETS = {"fcnn": (FCNN, {"width": 16}), "cnn": (CNN, {"channels": 2}), "gnn": (GNN, {"width": 4})}
-POD = {"rank": 30, "coordinates": 20, "width": 16, "blocks": 1}
 
 
 class OwnNet(torch.nn.Module):
-    """A network of a user, which names the base and its inputs."""
+    """A network of a user, which has no line about the base."""
 
-    base = "linear"
-    extra_inputs = ("amplitude", "parameters")
-
-    def __init__(self, scene):
+    def __init__(self, scene, inputs):
         super().__init__()
         self.layer = torch.nn.Linear(scene.problem.shape[1], scene.problem.shape[1])
+        self.scalars = torch.nn.Linear(inputs.scalars, 1)
 
-    def forward(self, field, amplitude, parameters):
-        numbers = 1 / (1 + amplitude) + parameters.sum(dim=1)
-        return self.layer(field) * numbers[:, None, None].to(field)
+    def forward(self, field, scalars):
+        return self.layer(field) * self.scalars(scalars)[:, :, None]
 
 
-@pytest.fixture(params=[*NETS, "own"])
-def surrogate_of(request):
-    """Builds the surrogate of a scene with a network of each kind, with a linear base."""
+NETS = {
+    "fcnn": (FCNN, {"width": 16}),
+    "cnn": (CNN, {"channels": 2}),
+    "gnn": (GNN, {"width": 4}),
+    "own": (OwnNet, {}),
+}
 
-    def build(scene, seed=0):
-        torch.manual_seed(seed)
-        kind, options = NETS.get(request.param, (OwnNet, None))
-        net = kind(scene) if options is None else kind(scene, base="linear", **options)
-        return Surrogate(net, RMSELoss(relative=1.0, floor=0.0), scene).eval()
 
-    return build
+def build(name, scene, base="linear", *, seed=0):
+    torch.manual_seed(seed)
+    kind, options = NETS[name]
+    network, loss = partial(kind, **options), RMSELoss(relative=1.0, floor=0.0)
+    surrogate = Surrogate.from_network(network, loss, scene, base=base).eval()
+    surrogate.log = lambda *_, **__: None
+    return surrogate
 
 
 @pytest.fixture(scope="module")
@@ -63,18 +56,22 @@ def relative(one, other):
     return (one - other).flatten(1).norm(dim=1) / other.flatten(1).norm(dim=1)
 
 
-@pytest.mark.parametrize("body", ["hexahedra", "tetrahedra", "triangles", "range of the law"])
-def test_the_difference_from_the_linear_solution_is_quadratic_in_the_load(
-    surrogate_of, bodies, body
-):
+@pytest.mark.parametrize(
+    ("body", "name"),
+    [
+        *[("hexahedra", "fcnn"), ("tetrahedra", "cnn"), ("triangles", "gnn")],
+        *[("range of the law", name) for name in NETS],
+    ],
+)
+def test_the_difference_from_the_linear_solution_is_quadratic_in_the_load(bodies, body, name):
     scene = bodies[body]
-    surrogate = surrogate_of(scene)
+    surrogate = build(name, scene)
     load = scene.loads.sample((0, 0), range(3))
     sizes = []
     with torch.no_grad():
         for factor in (1e-3, 1e-4):
             small = Load(factor * load.force, load.young, load.parameters)
-            linear = surrogate.base.solve(small)
+            linear = surrogate.predictor.base.solve(small)
             sizes.append((surrogate.predict(small) - linear).flatten(1).norm(dim=1))
     assert torch.allclose(sizes[0] / sizes[1], torch.full((3,), 100.0).double(), rtol=0.02)
     assert (sizes[0] < 0.01 * 1e-3 * surrogate.predict(load).flatten(1).norm(dim=1)).all()
@@ -96,17 +93,18 @@ def test_the_amplitude_is_the_size_of_the_linear_solution(scene, batch):
     assert torch.allclose(0.5 * amplitude[:, None, None] * field, linear)
 
 
-def test_a_zero_load_moves_nothing_and_has_finite_gradients(surrogate_of, scene, batch):
-    surrogate = surrogate_of(scene)
+@pytest.mark.parametrize("name", NETS)
+def test_a_zero_load_moves_nothing_and_has_finite_gradients(name, scene, batch):
     load = Load(torch.zeros_like(batch.force[:2]).requires_grad_(), batch.young[:2])
-    answer = surrogate.predict(load)
+    answer = build(name, scene).predict(load)
     assert torch.equal(answer, torch.zeros_like(answer))
     answer.sum().backward()
     assert load.force.grad.isfinite().all()
 
 
-def test_gradients_with_respect_to_the_force_are_those_of_differences(surrogate_of, scene, batch):
-    surrogate = surrogate_of(scene).double()
+@pytest.mark.parametrize("name", NETS)
+def test_gradients_with_respect_to_the_force_are_those_of_differences(name, scene, batch):
+    surrogate = build(name, scene).double()
     force = batch.force[:1].clone().requires_grad_()
     step = torch.randn(force.shape, generator=torch.Generator().manual_seed(0)).double()
     step = torch.where(scene.problem.free, 1e-5 * step * force.abs().max(), 0.0)
@@ -121,27 +119,23 @@ def test_gradients_with_respect_to_the_force_are_those_of_differences(surrogate_
 
 
 def test_training_uses_the_linear_solutions_that_were_computed_before(scene, batch, monkeypatch):
-    surrogate = Surrogate(FCNN(scene, width=8, base="linear"), MSE(relative=1.0), scene)
-    surrogate.log = lambda *_, **__: None
+    surrogate = build("fcnn", scene)
     group = symmetries(scene.problem)
     samples = surrogate.encode(batch, group)
     assert isinstance(samples, LinearSamples)
     assert len(samples) == len(group) * len(batch.force)
     every = samples.__getitems__(list(range(len(samples))))
     assert isinstance(every, LinearBatch)
-    expected = surrogate.base.solve(every.sample.load)
+    expected = surrogate.predictor.base.solve(every.sample.load)
     assert relative(every.linear.double(), expected).max() < 1e-5
     direct = surrogate.training_step(every.sample, 0)
     monkeypatch.setattr(LinearBase, "solve", None)
     assert torch.isclose(surrogate.training_step(every, 0), direct, rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", NETS)
+@pytest.mark.parametrize("name", ["fcnn", "cnn", "gnn"])
 def test_training_reduces_the_error_of_small_and_large_loads(name, scene, batch):
-    torch.manual_seed(0)
-    kind, options = NETS[name]
-    net = kind(scene, base="linear", **options)
-    surrogate = Surrogate(net, RMSELoss(relative=1.0, floor=0.0), scene)
+    surrogate = build(name, scene)
     small = solve(scene.solver, Load(0.1 * batch.force[:4], batch.young[:4])).displacement
     force = torch.cat([batch.force[:4], 0.1 * batch.force[:4]])
     both = batch._replace(
@@ -150,7 +144,6 @@ def test_training_reduces_the_error_of_small_and_large_loads(name, scene, batch)
         young=batch.young[:8],
         parameters=batch.parameters[:8],
     )
-    surrogate.log = lambda *_, **__: None
     optimizer = torch.optim.Adam(surrogate.parameters(), lr=3e-3)
     before = relative(LinearBase(scene).solve(both.load), both.displacement).view(2, 4).mean(dim=1)
     for _ in range(100):
@@ -162,41 +155,11 @@ def test_training_reduces_the_error_of_small_and_large_loads(name, scene, batch)
     assert (after < 0.9 * before).all()
 
 
-@pytest.mark.parametrize("loss", [MSE(), RMSELoss(relative=1.0, floor=0.0)], ids=["mse", "rmse"])
-def test_training_in_coordinates_has_the_loss_of_training_on_fields(scene, batch, loss):
-    torch.manual_seed(0)
-    net = PODNet(scene, base="linear", symmetry=False, **POD)
-    surrogate = Surrogate(net, loss, scene).train()
-    surrogate.log = lambda *_, **__: None
-    surrogate.fit_bases(batch)
-    reduced = surrogate.encode(batch)
-    assert isinstance(reduced, ReducedDataset)
-    own = reduced.__getitems__(list(range(len(batch.force))))
-    in_coordinates = surrogate.training_step(own, 0)
-    assert torch.isclose(in_coordinates, surrogate.training_step(batch, 0), rtol=1e-4)
-
-
-def test_pod_on_the_linear_solution_has_the_symmetries_of_the_body(scene, batch):
-    torch.manual_seed(0)
-    surrogate = Surrogate(PODNet(scene, base="linear", **POD), MSE(), scene).eval()
-    surrogate.fit_bases(batch)
-    group = symmetries(scene.problem)
-    assert len(group) > 1
-    which = torch.arange(len(group))[: len(batch.force)]
-    force = batch.force[: len(which)]
-    with torch.no_grad():
-        turned = surrogate.predict(Load(images(force, group, which), batch.young[: len(which)]))
-        expected = images(surrogate.predict(Load(force, batch.young[: len(which)])), group, which)
-    assert relative(turned, expected).max() < 1e-4
-
-
-@pytest.mark.parametrize("base", ["none", "linear"])
-@pytest.mark.parametrize("name", NETS)
+@pytest.mark.parametrize("base", [None, "linear"])
+@pytest.mark.parametrize("name", ["fcnn", "cnn", "gnn"])
 def test_half_precision_products_change_a_prediction_by_their_rounding(name, base, scene, batch):
     """As with `trainer.precision=bf16-mixed`; a bfloat16 number has 8 digits, in base 2."""
-    torch.manual_seed(0)
-    kind, options = NETS[name]
-    surrogate = Surrogate(kind(scene, base=base, **options), MSE(), scene).eval()
+    surrogate = build(name, scene, base)
     linear = LinearBase(scene).solve(batch.load) if base == "linear" else 0.0
     with torch.no_grad():
         exact = surrogate.predict(batch.load) - linear
@@ -206,36 +169,38 @@ def test_half_precision_products_change_a_prediction_by_their_rounding(name, bas
     assert 0 < relative(rounded, exact).max() < 0.1
 
 
-def test_a_checkpoint_has_the_weights_only(surrogate_of, scene, batch):
-    one, other = surrogate_of(scene, 0), surrogate_of(scene, 1)
-    assert not any(name.startswith("base") for name in one.state_dict())
+def test_a_checkpoint_has_scales_and_weights_only(scene, batch):
+    one, other = build("fcnn", scene), build("fcnn", scene, seed=1)
+    scales = {"largest_force", "predictor.force_scale", "predictor.displacement_scale"}
+    weights = {f"predictor.net.{name}" for name, _ in one.net.named_parameters()}
+    assert set(one.state_dict()) == scales | weights
     other.load_state_dict(one.state_dict())
     with torch.no_grad():
         assert torch.equal(one.predict(batch.load), other.predict(batch.load))
 
 
-@pytest.mark.parametrize("kind", [kind for kind, _ in NETS.values()])
-def test_an_unknown_base_is_refused(scene, kind):
-    with pytest.raises(ValueError, match="base = quadratic must be one of none, linear"):
-        kind(scene, base="quadratic")
-
-
 def test_what_excludes_a_base_is_refused(scene):
-    with pytest.raises(ValueError, match="young = true requires base = none"):
-        FCNN(scene, young=True, base="linear")
-    net = Unrolled(scene)
-    net.base = "linear"
-    with pytest.raises(ValueError, match="Unrolled requires base = none"):
-        Surrogate(net, MSE(), scene)
-    with pytest.raises(ValueError, match="amplitude is an input"):
-        CNN(scene, channels=2, base="linear")(torch.zeros(1, *scene.problem.shape))
+    with pytest.raises(ValueError, match="base = quadratic must be linear or null"):
+        Inputs.from_scene(scene, "quadratic")
+    with pytest.raises(ValueError, match="young = true requires base = null"):
+        Inputs.from_scene(scene, "linear", young=True)
+    with pytest.raises(ValueError, match="Unrolled requires base = null"):
+        Surrogate(Unrolled(scene), MSE(), scene, base="linear")
+
+
+def test_a_network_for_other_inputs_raises_an_error(scene, batch):
+    for kind, options in NETS.values():
+        for base, other in ((None, "linear"), ("linear", None)):
+            net = kind(scene, Inputs.from_scene(scene, base), **options)
+            with pytest.raises((RuntimeError, ValueError)):
+                Surrogate(net, MSE(), scene, base=other).predict(batch.load)
 
 
 def test_without_a_base_nothing_is_solved(scene, batch, monkeypatch):
     monkeypatch.setattr(LinearBase, "solve", None)
-    surrogate = Surrogate(GNN(scene, width=4), MSE(), scene)
-    assert surrogate.base is None
-    assert surrogate.encode(batch) is None
+    surrogate = build("gnn", scene, None)
+    assert isinstance(surrogate.predictor, Scaled)
+    assert not isinstance(surrogate.encode(batch), LinearSamples)
     assert surrogate.predict(batch.load).isfinite().all()
 
 
@@ -250,9 +215,8 @@ def test_a_run_is_loaded_and_evaluated(script, tiny, tmp_path, data):
     options = [*tiny, "experiment=gnn_linear", f"data={data}", *sizes, *short, "run=run"]
     trained = script("train", *options, cwd=tmp_path)
     assert trained.status == 0, trained.err
-    simulator = dpl.load(tmp_path / "run")
-    surrogate = simulator.surrogate
-    assert surrogate.net.base == "linear"
+    surrogate = dpl.load(tmp_path / "run").surrogate
+    assert isinstance(surrogate.predictor, OnLinearSolution)
     load = surrogate.scene.loads.sample((0, 0), range(1))
     with torch.no_grad():
         assert surrogate.predict(load).isfinite().all()

@@ -1,25 +1,15 @@
-"""Runs of a network that trains in reduced coordinates: stored, resumed, refused."""
+"""Runs of a network with bases: stored, resumed, refused."""
 
-import functools
 import json
-import shutil
 
 import pytest
 import torch
 
+import dpl.fem as fem
 from dpl.config import build, run_folder
 from dpl.data import Stream
 from dpl.training import Surrogate
 from dpl.training.checkpoints import read
-from dpl.training.surrogate import scales
-
-
-@pytest.fixture(scope="module", autouse=True)
-def scales_of_a_scene_once():
-    """Caches the scales of a scene, whose computation dominates the run time of these tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dpl.training.surrogate.scales", functools.cache(scales))
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +34,6 @@ def trained(script, overrides, home):
     if not (home / "whole").exists():
         ended = script("train", *overrides("whole"), cwd=home)
         assert ended.status == 0, ended.err
-        assert "the loss is computed in coordinates" in ended.out
     return home / "whole"
 
 
@@ -68,7 +57,7 @@ def test_a_loaded_run_has_the_same_predictions(trained, home, monkeypatch):
     cfg, module = run_folder.load_run(trained)
     saved = checkpoint(trained, "best.safetensors")["state_dict"]
     assert cfg.model._target_.endswith("PODNet")
-    assert module.net.fitted
+    assert module.net.is_fitted
     assert alike(saved, dict(module.state_dict()))
     again = run_folder.load_run(trained)[1]
     test = build.instantiate(cfg, "data", scene=module.scene).samples("test")
@@ -87,7 +76,7 @@ def test_a_run_fits_its_bases_to_the_training_samples(trained, home, monkeypatch
     cfg, module = run_folder.load_run(trained)
     train = build.instantiate(cfg, "data", scene=module.scene).samples("train")
     expected = build.build_surrogate(cfg, module.scene)
-    expected.fit_bases(train)
+    expected.fit_bases(train, fem.symmetries(module.scene.problem))
     buffers = dict(expected.net.named_buffers())
     assert buffers["modes"].any()
     assert alike(buffers, dict(module.net.named_buffers()))
@@ -116,29 +105,13 @@ def test_an_interrupted_run_ends_bit_for_bit_like_an_uninterrupted_one(
         assert alike(whole[part], resumed[part]), part
 
 
-@pytest.mark.xfail(
-    strict=True, reason="Lightning names the checkpoint after setup: made, then lost"
-)
-def test_a_resumed_run_does_not_fit_its_bases_again(trained, script, overrides, home, monkeypatch):
-    made, prepare = [], Surrogate.fit_bases
-    monkeypatch.setattr(
-        Surrogate, "fit_bases", lambda module, samples: made.append(0) or prepare(module, samples)
-    )
-    shutil.copytree(trained, home / "longer")
-    more = ("ckpt_path=last", "trainer.max_epochs=5")
-    assert script("train", *overrides("longer", *more), cwd=home).status == 0
-    assert checkpoint(home / "longer")["epoch"] == 4
-    assert made == []
-
-
 def test_a_run_resumed_before_its_first_epoch_fits_its_bases(script, overrides, home, trained):
     """The command line is the same for the first start of a job and later ones."""
     more = ("ckpt_path=last", "trainer.max_epochs=1")
     ended = script("train", *overrides("fresh", *more), cwd=home)
     assert ended.status == 0, ended.err
     state = checkpoint(home / "fresh")["state_dict"]
-    assert state["net.fitted"]
-    assert state["net.modes"].any()
+    assert state["predictor.net.modes"].any()
 
 
 def test_a_stream_fits_the_bases_to_the_validation_loads(script, overrides, home, trained):
@@ -155,24 +128,11 @@ def test_a_stream_fits_the_bases_to_the_validation_loads(script, overrides, home
     data = build.instantiate(cfg, "data", scene=module.scene)
     assert isinstance(data.source, Stream)
     expected = build.build_surrogate(cfg, module.scene)
-    expected.fit_bases(data.samples("val"))
+    expected.fit_bases(data.samples("val"), fem.symmetries(module.scene.problem))
     assert alike(dict(expected.net.named_buffers()), dict(module.net.named_buffers()))
     weights = [dict(one.net.named_parameters()) for one in (expected, module)]
     assert not alike(*weights), "it has learnt"
     assert json.loads((home / "stream" / "evaluation.json").read_text())
-
-
-def test_skipped_work_of_a_stream_mentions_coordinates_from_disk_only(script, overrides, home):
-    kept = [o for o in overrides("reported") if "data.train" not in o]
-    more = [
-        "data=online",
-        "data.train.batches=1",
-        "data.train.new_per_round=4",
-        "trainer.max_epochs=1",
-    ]
-    ended = script("train", *kept, *more, cwd=home)
-    assert ended.status == 0
-    assert "no fields in training:" not in ended.out
 
 
 @pytest.mark.parametrize(
@@ -180,7 +140,6 @@ def test_skipped_work_of_a_stream_mentions_coordinates_from_disk_only(script, ov
     [
         ("model.rank=0", "model: rank = 0 must be 1 or more"),
         ("model.blocks=-1", "model: blocks = -1 must be 0 or more"),
-        ("model.symmetry=3", "model.symmetry = 3 must be true or false"),
         ("model.rank=1.5", "model.rank = 1.5 must be a whole number"),
         ("+model.modes=3", "model.modes: dpl.models.PODNet has no such option"),
         ("optimizer.momentum=1.5", "optimizer: momentum = 1.5 must be"),

@@ -65,17 +65,14 @@ def test_lower_precision_of_products_does_not_reach_the_whitening(fields):
 
 def test_a_network_with_a_base_reads_whitened_linear_solutions(scene, batch):
     class Spy(torch.nn.Module):
-        base = "linear"
-        extra_inputs = ()
-
-        def forward(self, field):
+        def forward(self, field, scalars):
             self.seen = field
             return field
 
-    surrogate = Surrogate(Spy(), MSE(), scene)
+    surrogate = Surrogate(Spy(), MSE(), scene, base="linear")
     surrogate.predict(batch.load)
-    scale = surrogate.displacement_scale
-    field, _ = surrogate.base.scale_inputs(surrogate.base.solve(batch.load), scale)
-    random = surrogate.base.scale_inputs(sampled_solutions(scene)[1], scale).field
+    base, scale = surrogate.predictor.base, surrogate.predictor.displacement_scale
+    field, _ = base.scale_inputs(base.solve(batch.load), scale)
+    random, _ = base.scale_inputs(sampled_solutions(scene)[1], scale)
     own = FieldWhitening(random, scene.problem.free)
     assert torch.allclose(surrogate.net.seen, own(field.float()), atol=1e-4)

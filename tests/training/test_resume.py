@@ -34,16 +34,14 @@ from torch import nn
 class Noisy(nn.Module):
     '''A network whose training draws from every generator there is.'''
 
-    def __init__(
-        self, scene, *, layers=0, width=None, all_dofs=False, young=False, base="none"
-    ):
+    def __init__(self, scene, *, layers=0, width=None, all_dofs=False):
         super().__init__()
         size = scene.problem.points.numel()
         self.dropout, self.linear = nn.Dropout(0.3), nn.Linear(size, size)
         random.seed(0)
         np.random.seed(0)
 
-    def forward(self, force):
+    def forward(self, force, scalars):
         x = self.dropout(force.flatten(1))
         if self.training:
             x = x * (1 + 0.1 * random.gauss(0, 1) + 0.1 * np.random.standard_normal())

@@ -60,7 +60,7 @@ class StiffnessIteration:
                 f"the parameters {list(terms.problem.material.parameter_ranges)} change K(0) by "
                 f"factors whose ratio is up to {found.condition:.3g}, so that the linear solution "
                 f"of this network takes more than {MAX_BOUND} steps; give them smaller ranges, or "
-                "use model.base=none (fcnn, cnn, gnn)"
+                "use model.base=null (fcnn, cnn, gnn)"
             )
         return found
 

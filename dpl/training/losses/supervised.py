@@ -1,7 +1,5 @@
 """Supervised losses: squared errors of displacements."""
 
-from typing import Protocol, runtime_checkable
-
 from torch import Tensor
 
 from dpl.scene import Sample
@@ -9,15 +7,6 @@ from dpl.system.checks import check_range
 from dpl.training.losses.loss import Loss, LossContext, clamp_scale, squared_error
 
 SMALLEST_SQUARE = 1e-24  # added to squared errors: the root has no gradient at zero [-]
-
-
-@runtime_checkable
-class SquaredErrorLoss(Protocol):
-    """Loss of squared errors, on which a `TrainsInCoordinates` network trains without fields."""
-
-    def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
-        """Return the loss () of mean squared errors (B,) and mean squared displacements (B,)."""
-        ...
 
 
 class MSE(Loss):
@@ -42,15 +31,15 @@ class MSE(Loss):
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         """See `Loss`."""
+        return self._weighted_errors(prediction, batch).mean()
+
+    def _weighted_errors(self, prediction: Tensor, batch: Sample) -> Tensor:
+        """Return mean squared errors over powers of mean squared displacements, (B,)."""
+        error = squared_error(prediction, batch)
+        if not self.relative:
+            return error
         size = batch.displacement.square().mean(dim=(1, 2))
-        return self.from_squared_errors(squared_error(prediction, batch), size)
-
-    def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
-        """See `SquaredErrorLoss`."""
-        return self._weighted(error, size).mean()
-
-    def _weighted(self, error: Tensor, size: Tensor) -> Tensor:
-        return error / clamp_scale(size, self.floor) ** self.relative if self.relative else error
+        return error / clamp_scale(size, self.floor) ** self.relative
 
 
 class RMSELoss(MSE):
@@ -60,6 +49,6 @@ class RMSELoss(MSE):
     than in the mean squared error.
     """
 
-    def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
-        """See `SquaredErrorLoss`."""
-        return (self._weighted(error, size) + SMALLEST_SQUARE).sqrt().mean()
+    def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
+        """See `Loss`."""
+        return (self._weighted_errors(prediction, batch) + SMALLEST_SQUARE).sqrt().mean()

@@ -1,0 +1,299 @@
+"""The three kinds of predictors: functions of loads that return displacements over L.
+
+A predictor is the only border between float64 mechanics and a float32 network.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Self, cast
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import Dataset
+
+from dpl.data.samples import Samples
+from dpl.fem import Load
+from dpl.fem.symmetry import Symmetry, images
+from dpl.models.inputs import Base, Inputs
+from dpl.models.linear_base import LinearBase, sampled_solutions
+from dpl.models.protocols import HasBases
+from dpl.models.stored_buffers import StoredBuffers
+from dpl.scene import Sample, Scene
+from dpl.training.linear_samples import LinearBatch, LinearSamples, linear_solutions
+from dpl.training.losses.loss import Loss, LossContext
+
+MAX_SNAPSHOTS = 4096  # samples and images from which a network computes its bases
+SCALES = ("force_scale", "displacement_scale")
+
+
+class Predictor(StoredBuffers):
+    """A function of loads that returns displacements over L, (B, N, D) [-], float64.
+
+    Subclasses define `forward(load)`.
+
+    Attributes:
+        net: The network.
+        scene: The scene.
+        problem: The finite-element problem of the scene, on the device of the network.
+        force_scale: Root mean square of forces, () [-].
+        displacement_scale: Root mean square of displacements, () [-].
+        reads_young: True if Young's modulus is an input of the network.
+        is_closed_form: True for a model that `dpl.training.fit` fits, without gradient descent.
+        meaning: Formula of the displacement, for a program that reads an exported surrogate.
+    """
+
+    meaning: ClassVar[str]
+    is_closed_form: ClassVar[bool] = False
+    reads_young = False
+    force_scale: Tensor
+    displacement_scale: Tensor
+
+    def __init__(self, net: nn.Module, scene: Scene, *scales: Tensor) -> None:
+        """Store network, scene and `SCALES`; they are 1 by default."""
+        super().__init__()
+        self.net, self.scene, self.problem = net, scene, scene.problem
+        for name, scale in zip(SCALES, scales or torch.ones(2).double(), strict=True):
+            self.register_buffer(name, scale.clone())
+
+    def predict_batch(self, batch: Any) -> tuple[Tensor, Sample]:
+        """Return the displacements of a batch of `dataset`, and its samples."""
+        return self(batch.load), batch
+
+    def dataset(self, samples: Sample, group: Sequence[Symmetry] = ()) -> Dataset:
+        """Return what the predictor is trained on: samples and their images.
+
+        Args:
+            samples: The samples, (S, N, D).
+            group: Symmetries of the body whose images of samples are wanted; empty for none.
+        """
+        return Samples(samples, group)
+
+    def examples(self, samples: Sample) -> tuple[Tensor, Tensor]:
+        """Return fields and wanted outputs of the network, (S, N, D) each, float64."""
+        raise NotImplementedError
+
+    @property
+    def lacks_bases(self) -> bool:
+        """True for a network that `HasBases` before they are computed."""
+        return hasattr(self.net, "fit_bases") and not cast(HasBases, self.net).is_fitted
+
+    def fit_bases(self, samples: Sample, group: Sequence[Symmetry] = ()) -> None:
+        """Let the network compute its bases from samples (S, N, D) and their images."""
+        members = range(max(1, len(group)))
+        stride = -(-len(samples.force) * len(members) // MAX_SNAPSHOTS)
+        few = Sample(*(column[::stride].to(self.force_scale.device) for column in samples))
+        which = [torch.full((len(few.force),), k) for k in members]
+        fields = (torch.cat([images(part, group, k) for k in which]) for part in self.examples(few))
+        cast(HasBases, self.net).fit_bases(*fields)
+
+    def scalars(self, load: Load, *computed: Tensor) -> Tensor:
+        """Return the scalars of loads, (B, S), in the dtype of the network.
+
+        Args:
+            load: The loads.
+            computed: Scalars before the ranges of the body, (B,) each.
+        """
+        ranges, parameters = self.scene.loads.parameter_ranges, self.parameters_of(load)
+        pairs = zip(ranges.values(), parameters.unbind(-1), strict=True)
+        columns = [*computed, *(ends.normalise(column) for ends, column in pairs)]
+        if not columns:
+            return load.force.new_zeros(load.force.shape[0], 0, dtype=self.dtype)
+        return torch.stack([column.to(self.dtype) for column in columns], dim=1)
+
+    def parameters_of(self, load: Load) -> Tensor:
+        """Return the values of the ranges of the body, (B, P).
+
+        Raises:
+            ValueError: The load has not one parameter for each range of the body.
+        """
+        names = list(self.scene.loads.parameter_ranges)
+        if (found := load.parameters.shape[-1]) != len(names):
+            raise ValueError(f"Load.parameters has {found} columns; the body has ranges of {names}")
+        return load.parameters
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Type of the weights."""
+        return next((weights.dtype for weights in self.net.parameters()), torch.float32)
+
+    def loss(self, batch: Any, loss: Loss, physics: LossContext) -> Tensor:
+        """Return the loss of a batch of `dataset`, ()."""
+        return loss(*self.predict_batch(batch), physics)
+
+    def describe(self, loss: Loss) -> str:
+        """Return name and size of the network, and the loss."""
+        count = sum(weights.numel() for weights in self.net.parameters())
+        return f"{type(self.net).__name__}, {count:,} weights; loss {type(loss).__name__}"
+
+    def skipped_work(self) -> list[str]:
+        """Return the work that the network saves, one line each."""
+        return list(getattr(self.net, "skipped_work", list)())
+
+    def check_buffers(self) -> None:
+        """Raise ValueError if a scale is not positive."""
+        for name in SCALES:
+            if not (value := getattr(self, name)) > 0:
+                raise ValueError(f"{name} = {float(value)} must be above 0")
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move the module and its problem; all ways to move a module end here."""
+        super()._apply(fn, recurse)
+        device, own = self.force_scale.device, self.scene.problem
+        if self.problem.points.device != device:
+            self.problem = own if own.points.device == device else own.to(device)
+        return self
+
+
+class Scaled(Predictor):
+    """A network from scaled forces to scaled displacements.
+
+    The displacement is s N(f / r, scalars) with the scales r and s of forces and displacements.
+    """
+
+    meaning = (
+        "input = force / (young force_unit scales.force); network; displacement = length "
+        "scales.displacement output, the prescribed displacement at fixed degrees of freedom"
+    )
+
+    def __init__(self, net: nn.Module, scene: Scene, *, young: bool = False) -> None:
+        """Compute the scales.
+
+        Args:
+            net: The network, built with `Inputs.from_scene(scene, young=young)`.
+            scene: The scene.
+            young: Give Young's modulus to the network, as the paper does: fields are forces over
+                the largest modulus, and E, or log E for moduli with a logarithmic distribution,
+                mapped to [-1, 1], is a scalar. It adds no information, since u/L depends on
+                f/(E L^2) alone.
+        """
+        super().__init__(net, scene, *scales(scene, *sampled_solutions(scene)))
+        self.reads_young, self._moduli = young, scene.loads.moduli
+
+    def forward(self, load: Load) -> Tensor:
+        """Return displacements over L, (B, N, D) [-], float64."""
+        field, moduli = self._field(load.force), list[Tensor]()
+        if self.reads_young:
+            field = (load.young / self._moduli.high)[:, None, None] * field
+            moduli = [self._moduli.normalise(load.young)]
+        output = self.net(field.to(self.dtype), self.scalars(load, *moduli))
+        displacement = output.double() * self.displacement_scale
+        return torch.where(self.problem.free, displacement, self.problem.prescribed)
+
+    def _field(self, force: Tensor) -> Tensor:
+        """Return scaled forces (B, N, D) with the values of training on fixed dofs."""
+        force, constant = self.problem.acting(force), self.scene.loads.constant_force
+        if constant is not None:
+            force = force + torch.where(self.problem.free, 0.0, constant.to(force.device))
+        return force / self.force_scale
+
+    def examples(self, samples: Sample) -> tuple[Tensor, Tensor]:
+        """Return scaled forces and scaled displacements."""
+        output = samples.displacement / self.displacement_scale
+        return self._field(samples.force), torch.where(self.problem.free, output, 0.0)
+
+
+class OnLinearSolution(Predictor):
+    """A network whose gated output is added to the linear solution, see `LinearBase`."""
+
+    meaning = (
+        "v = linear solution over length, a = rms(v) / scales.displacement; input = whitened "
+        "v/rms(v) and a; network; displacement = length (v + scales.displacement a^2 / (1 + a) "
+        "output)"
+    )
+
+    def __init__(self, net: nn.Module, scene: Scene) -> None:
+        """Compute the scales and the whitening.
+
+        Args:
+            net: The network, built with `Inputs.from_scene(scene, "linear")`.
+            scene: The scene.
+
+        Raises:
+            ValueError: K(0) changes too much with the parameters.
+        """
+        force, linear = sampled_solutions(scene)
+        super().__init__(net, scene, *scales(scene, force, linear))
+        self.base = LinearBase(scene, linear)
+
+    def forward(self, load: Load, linear: Tensor | None = None) -> Tensor:
+        """Return displacements over L, (B, N, D) [-], float64.
+
+        Args:
+            load: The loads.
+            linear: Their linear solutions, (B, N, D) [-], if they are known.
+        """
+        linear = self.base.solve(load) if linear is None else linear.double()
+        field, amplitude = self.base.scale_inputs(linear, self.displacement_scale)
+        scalars = self.scalars(load, 2 * amplitude / (1 + amplitude) - 1)
+        output = self.net(self.base.whiten(field.to(self.dtype)), scalars).double()
+        gate = self.base.gate(amplitude)[:, None, None]
+        nonlinear = gate * (output * self.displacement_scale)
+        return linear + torch.where(self.problem.free, nonlinear, 0.0)
+
+    def predict_batch(self, batch: LinearBatch | Sample) -> tuple[Tensor, Sample]:
+        """Return the displacements of a batch; batches of a stream have no linear solutions."""
+        if isinstance(batch, LinearBatch):
+            return self(batch.sample.load, batch.linear), batch.sample
+        return self(batch.load), batch
+
+    def dataset(self, samples: Sample, group: Sequence[Symmetry] = ()) -> Dataset:
+        """Return samples with their linear solutions, which are computed once."""
+        return LinearSamples(samples, self.base, group)
+
+    def examples(self, samples: Sample) -> tuple[Tensor, Tensor]:
+        """Return whitened linear solutions and scaled nonlinear displacements."""
+        linear, scale = linear_solutions(samples.load, self.base).double(), self.displacement_scale
+        field, amplitude = self.base.scale_inputs(linear, scale)
+        missed = torch.where(self.problem.free, samples.displacement - linear, 0.0)
+        return self.base.whiten(field), self.base.scale_outputs(missed, amplitude, scale)
+
+    def skipped_work(self) -> list[str]:
+        """Return the work that the network and the base save, one line each."""
+        line = "no learning of linear elasticity: the network adds to K(0)^-1 f"
+        return [*super().skipped_work(), line]
+
+
+class Fitted(Predictor):
+    """A model that `ClosedFormFit` describes, without trained weights."""
+
+    meaning = "input = force / (young force_unit); model; displacement = length output"
+    is_closed_form = True
+
+    def forward(self, load: Load) -> Tensor:
+        """Return displacements over L, (B, N, D) [-], float64."""
+        return cast(Tensor, self.net(load.force, self.parameters_of(load)))
+
+    def describe(self, loss: Loss) -> str:
+        """Return the name of the model."""
+        return f"{type(self.net).__name__}, fitted by linear regression"
+
+
+def predictor_of(
+    net: nn.Module, scene: Scene, base: Base | None = None, *, young: bool = False
+) -> Predictor:
+    """Return the predictor of a network, or of a model that is fitted (it defines `fit`).
+
+    Raises:
+        ValueError: There is no such base, or it excludes another option.
+    """
+    Inputs.from_scene(scene, base, young=young)  # checks the options
+    if hasattr(net, "fit"):
+        if base is not None:
+            raise ValueError(f"{type(net).__name__} requires base = null, not {base}")
+        return Fitted(net, scene)
+    return Scaled(net, scene, young=young) if base is None else OnLinearSolution(net, scene)
+
+
+def scales(scene: Scene, force: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the scales of forces and displacements, scalars [-].
+
+    They are root mean squares: of forces over loadable degrees of freedom, of displacements over
+    free degrees of freedom.
+
+    Args:
+        scene: The scene.
+        force: Forces of random loads, (S, N, D) [-].
+        displacement: Their linear solutions, (S, N, D) [-].
+    """
+    force = force[:, scene.loads.loadable_dofs]
+    displacement = displacement[:, scene.problem.free]
+    return force.square().mean().sqrt(), displacement.square().mean().sqrt()
