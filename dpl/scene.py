@@ -334,6 +334,6 @@ def _differences(theirs: Any, ours: Mapping[str, Any], path: str = "") -> list[s
     return lines
 
 
-def stack(samples: list[Sample]) -> Sample:
+def stack(samples: Sequence[Sample]) -> Sample:
     """Return single samples (N, D) as a batch (B, N, D)."""
     return Sample(*(torch.stack(column) for column in zip(*samples, strict=True)))

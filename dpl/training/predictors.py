@@ -172,7 +172,7 @@ class Scaled(Predictor):
         """Return displacements over L, (B, N, D) [-], float64."""
         field, moduli = self._field(load.force), list[Tensor]()
         if self.reads_young:
-            field = (load.young / self._moduli.high)[:, None, None] * field
+            field = (load.young / self._moduli[1])[:, None, None] * field
             moduli = [self._moduli.normalise(load.young)]
         output = self.net(field.to(self.dtype), self.scalars(load, *moduli))
         displacement = output.double() * self.displacement_scale
