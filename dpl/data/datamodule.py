@@ -1,6 +1,5 @@
 """Lightning data module of a data set on disk."""
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, Literal
 
@@ -14,7 +13,7 @@ from dpl.data.dataset import DataSet
 from dpl.data.growth import Growth
 from dpl.data.replay_buffer import ReplayBuffer, transform
 from dpl.fem import symmetries
-from dpl.fem.symmetry import Symmetry
+from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.threads import leave_cores
@@ -25,7 +24,7 @@ MAX_COUNT = 10**9  # of batches, and of samples in a batch
 class Samples(Dataset):
     """Samples in memory and their images under symmetries, read a batch at a time."""
 
-    def __init__(self, samples: Sample, group: Sequence[Symmetry] = ()) -> None:
+    def __init__(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> None:
         """Store the samples, (B, ...), and the symmetries of their body, identity first."""
         self.samples = samples
         self.group = group
@@ -104,10 +103,10 @@ class OfflineData(L.LightningDataModule):
         self._loaded: dict[str, tuple[int, Sample]] = {}  # with the number of loads tried
 
     @cached_property
-    def group(self) -> list[Symmetry]:
+    def group(self) -> SymmetryGroup:
         """Symmetries whose images are training samples; empty without `symmetry`."""
         if not self.symmetry:
-            return []
+            return NO_SYMMETRIES
         constant = self.scene.loads.constant_force
         return symmetries(self.scene.problem, also=[] if constant is None else [constant])
 

@@ -4,7 +4,7 @@ import itertools
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 
 from dpl.data.solving.worker_pool import MAX_CONSECUTIVE_CRASHES, MAX_RETRIES
 from dpl.data.stream import DrawnSample, OnlineSamples
-from dpl.fem.symmetry import Symmetry, images
+from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.scene import Sample, stack
 from dpl.system.processes import block_signals, spawn_context
 
@@ -77,7 +77,7 @@ class ReplayBuffer:
     reuse: int
     capacity: int
     seed: int = 0
-    group: Sequence[Symmetry] = ()
+    group: SymmetryGroup = NO_SYMMETRIES
     errors: Callable[[], Tensor | None] = lambda: None
     report: Callable[[StreamRates], None] = lambda rates: None
     produced: int = field(default=0, init=False)
@@ -251,9 +251,9 @@ class _Buffer:
         return self._point[self._error.argsort(descending=True)[:count]]
 
 
-def transform(batch: Sample, group: Sequence[Symmetry], which: Tensor) -> Sample:
+def transform(batch: Sample, group: SymmetryGroup, which: Tensor) -> Sample:
     """Return samples transformed by symmetries of the body, `which` of them for each, (B,)."""
-    force, displacement = (images(field, group, which) for field in batch[:2])
+    force, displacement = (group.images(field, which) for field in batch[:2])
     return batch._replace(force=force, displacement=displacement)
 
 

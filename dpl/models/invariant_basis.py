@@ -9,11 +9,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.parity import Parities, SignedOrbits
-from dpl.fem.rom.pod import MIN_SKETCH_SIZE, pod
-from dpl.fem.symmetry import Symmetry, images
+from dpl.fem.rom.pod import MIN_SKETCH_SIZE, orthonormal_fields, pod, scatter_fields
+from dpl.fem.symmetry import Symmetry
 from dpl.models.irreps import Component, representations_of
 from dpl.models.symmetric_fields import Orbits
+
+__all__ = ["orthonormal_fields", "scatter_fields"]
 
 CHUNK = 256  # snapshots that are transformed at a time
 MAX_BYTES = 2**31  # of snapshots from which a basis is computed, in float32
@@ -25,57 +26,17 @@ def pad_columns(basis: Tensor, rank: int) -> Tensor:
     return nn.functional.pad(basis, (0, rank - basis.shape[1]))
 
 
-def scatter_fields(columns: Tensor, dofs: Tensor) -> Tensor:
-    """Return fields (S, N, D), zero outside the mask, from their values (S, n)."""
-    dofs = dofs.to(columns.device)
-    fields = columns.new_zeros(len(columns), *dofs.shape)
-    fields[:, dofs] = columns
-    return fields
-
-
-def orthonormal_fields(columns: Tensor, dofs: Tensor) -> Tensor:
-    """Return orthonormal fields (N, D, R), zero outside the mask, that span columns (n, R)."""
-    orthonormal = torch.linalg.qr(columns.double().cpu())[0]
-    return scatter_fields(orthonormal.T, dofs.cpu()).movedim(0, -1).contiguous()
-
-
 def image_columns(columns: Tensor, dofs: Tensor, group: Sequence[Symmetry], k: int) -> Tensor:
     """Return the images (S, n) of fields (S, n) under symmetry k."""
     if k == 0:
         return columns
-    fields = scatter_fields(columns, dofs)
-    return images(fields, group, torch.full((len(fields),), k))[:, dofs.to(columns.device)]
+    return group[k].image(scatter_fields(columns, dofs))[:, dofs.to(columns.device)]
 
 
 def group_actions(basis: Tensor, dofs: Tensor, group: Sequence[Symmetry]) -> Tensor:
     """Return the matrices T_g, (G, r, r), of a basis (n, r): images have coordinates c T_g."""
     members = range(max(1, len(group)))
     return torch.stack([image_columns(basis.T, dofs, group, k) @ basis for k in members])
-
-
-def modes_of_parity(
-    modes: Tensor, free: Tensor, group: Sequence[Symmetry]
-) -> tuple[Tensor, Tensor]:
-    """Return modes (n, R) of definite parity, rounded to float32, and their parities (R,)."""
-    parities = Parities.of(group, free.shape[1])
-    members = [group[k] for k in parities.members.tolist()] if group else group
-    rotation, parity = parities.adapted(group_actions(modes, free, members))
-    orbits = SignedOrbits.of_field(parities, group, free)
-    exact = orbits.symmetrised(modes @ rotation, parity, parities)
-    return exact.float().double(), parity
-
-
-def invariant_rank(actions: Tensor, most: int) -> int:
-    """Return the largest k up to `most` for which the first k modes are invariant, or 0.
-
-    Args:
-        actions: Matrices T_g, (G, r, r), see `group_actions`.
-        most: Largest number of modes.
-    """
-    for k in range(most, 0, -1):
-        if float(actions[:, :k, k:].square().sum()) < 0.5:  # a multiplet that is split adds one
-            return k
-    return 0
 
 
 class InvariantPOD:

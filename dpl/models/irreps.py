@@ -10,9 +10,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.fem.symmetry import Symmetry, products
+from dpl.fem.symmetry import Symmetry
 
 SAME = 1e-8  # difference below which eigenvalues, or mean products of characters, are equal
+
+
+def products(group: Sequence[Symmetry]) -> Tensor:
+    """Return the multiplication table (G, G) int64 of a group; (1, 1) for an empty group."""
+    if not group:
+        return torch.zeros(1, 1, dtype=torch.int64)
+    Q = torch.stack([symmetry.rotation for symmetry in group]).cpu()
+    every = Q[None] @ Q[:, None]  # first i, then j
+    return (every[:, :, None] - Q).flatten(3).norm(dim=3).argmin(dim=2)
 
 
 def irreducible_representations(table: Tensor) -> list[Tensor]:
@@ -23,7 +32,7 @@ def irreducible_representations(table: Tensor) -> list[Tensor]:
     happens to rotations about one axis, one of these is returned, complex and with d = 1.
 
     Args:
-        table: Multiplication table, (G, G), see `dpl.fem.symmetry.products`.
+        table: Multiplication table, (G, G), see `products`.
     """
     count = len(table)
     inverse = (table == 0).int().argmax(dim=1)  # the identity is the first member

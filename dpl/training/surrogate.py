@@ -1,7 +1,7 @@
 """The LightningModule: a network with scales, loss, metrics and optimiser."""
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Self, cast
 
 import lightning as L
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem import Load
-from dpl.fem.symmetry import Symmetry
+from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.models.linear_base import SCALE_STREAM, LinearBase, check_base, sampled_solutions
 from dpl.models.protocols import ClosedFormFit, HasBase, TrainsInCoordinates
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
@@ -215,7 +215,7 @@ class Surrogate(L.LightningModule):
         return loss.from_squared_errors(error, square * batch.mean_square)
 
     def encode(
-        self, samples: Sample, group: Sequence[Symmetry] = ()
+        self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES
     ) -> ReducedDataset | LinearSamples | None:
         """Return training samples (S, N, D) in reduced coordinates or with their linear solutions.
 

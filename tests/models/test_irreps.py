@@ -6,9 +6,9 @@ import math
 import pytest
 import torch
 
-from dpl.fem.symmetry import Symmetry, products
+from dpl.fem.symmetry import Symmetry
 from dpl.models.invariant_basis import InvariantPOD, image_columns
-from dpl.models.irreps import irreducible_representations
+from dpl.models.irreps import irreducible_representations, products
 
 
 def rotations_of(order):

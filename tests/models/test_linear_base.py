@@ -10,7 +10,6 @@ from dpl.fem import (
     solve,
     symmetries,
 )
-from dpl.fem.symmetry import images
 from dpl.models import CNN, FCNN, GNN, LinearBase, PODNet, Unrolled
 from dpl.models.reduced_samples import ReducedDataset
 from dpl.training import MSE, RMSELoss, Surrogate
@@ -185,8 +184,8 @@ def test_pod_on_the_linear_solution_has_the_symmetries_of_the_body(scene, batch)
     which = torch.arange(len(group))[: len(batch.force)]
     force = batch.force[: len(which)]
     with torch.no_grad():
-        turned = surrogate.predict(Load(images(force, group, which), batch.young[: len(which)]))
-        expected = images(surrogate.predict(Load(force, batch.young[: len(which)])), group, which)
+        turned = surrogate.predict(Load(group.images(force, which), batch.young[: len(which)]))
+        expected = group.images(surrogate.predict(Load(force, batch.young[: len(which)])), which)
     assert relative(turned, expected).max() < 1e-4
 
 

@@ -21,7 +21,6 @@ from dpl.fem import (
     rectangle,
     solve,
 )
-from dpl.fem.symmetry import images
 from dpl.models import PODNet
 from dpl.models.invariant_basis import InvariantPOD, image_columns, scatter_fields
 from dpl.training import MSE, LrStar, PotentialEnergyLoss, Surrogate
@@ -281,7 +280,7 @@ def test_a_training_on_fields_learns_no_symmetries(bar, loss):
     module.fit_bases(samples)
     module.double()
     assert module.encode(samples, net.group) is None
-    moved = [images(field, net.group, torch.full((16,), 5)) for field in samples[:2]]
+    moved = [net.group[5].image(field) for field in samples[:2]]
     found = []
     for batch in (samples, Sample(*moved, samples.young)):
         module.zero_grad()

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from dpl import Sample
-from dpl.fem.symmetry import images
 from dpl.models import FCNN, PODNet
 from dpl.models.linear_base import sampled_solutions
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
@@ -178,7 +177,7 @@ def test_images_of_coordinates_are_coordinates_of_images(make_scene):
     assert len(whole) == 8 * 16
     for k in range(8):
         which = torch.full((16,), k)
-        moved = Sample(*(images(f, net.group, which) for f in samples[:2]), samples.young)
+        moved = Sample(*(net.group.images(f, which) for f in samples[:2]), samples.young)
         part = whole.__getitems__(list(range(16 * k, 16 * k + 16)))
         for found, expected in zip(part, encoded(module, moved), strict=True):
             size = float(expected.abs().max())

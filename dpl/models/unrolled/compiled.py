@@ -1,6 +1,5 @@
 """Prediction of an unrolled reduced solver by one compiled call."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
@@ -17,7 +16,7 @@ from dpl.fem.linear.condensation import Fronts
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedInverse
-from dpl.fem.symmetry import Symmetry
+from dpl.fem.symmetry import SymmetryGroup
 from dpl.models.unrolled import iterated_loops
 from dpl.models.unrolled.iterated_loops import IterationArrays, predict_iterated
 from dpl.models.unrolled.loops import (
@@ -76,7 +75,7 @@ class CompiledPrediction:
     @classmethod
     def of(
         cls,
-        group: Sequence[Symmetry],
+        group: SymmetryGroup,
         free: Tensor,
         *,
         parity: Tensor,
