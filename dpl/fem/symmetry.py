@@ -52,8 +52,9 @@ class SymmetryGroup(tuple[Symmetry, ...]):
     @classmethod
     def identity(cls, problem: Problem) -> Self:
         """Return the group of the identity alone."""
-        nodes, dim = problem.shape
-        return cls([Symmetry(torch.eye(dim, dtype=torch.float64), torch.arange(nodes))])
+        (nodes, dim), device = problem.shape, problem.points.device
+        rotation = torch.eye(dim, dtype=torch.float64, device=device)
+        return cls([Symmetry(rotation, torch.arange(nodes, device=device))])
 
     @property
     def rotations(self) -> Tensor:
@@ -67,8 +68,11 @@ class SymmetryGroup(tuple[Symmetry, ...]):
         others = Q - torch.diag_embed(Q.diagonal(dim1=1, dim2=2))
         return (~others.flatten(1).any(dim=1)).nonzero()[:, 0]
 
-    def beyond_diagonal(self) -> "list[Symmetry]":
-        """Return one member g of each coset: each member is h g with h in `diagonal`."""
+    def coset_representatives(self) -> list[Symmetry]:
+        """Return one member g of each coset of `diagonal`, the identity first.
+
+        Each member of the group is a product h g with h in `diagonal`: first g, then h.
+        """
         Q = self.rotations
         products = (Q[self.diagonal][:, None] @ Q).flatten(2)
         numbers = torch.cdist(products, Q.flatten(1)).argmin(dim=2)  # of h g, (M, G)

@@ -166,7 +166,7 @@ def test_reflections_and_one_member_of_each_coset_compose_all_members(mesh, fixe
     problem = fem.Problem.build(mesh, NH, fixed=fixed)
     group = fem.symmetries(problem)
     field = torch.randn(problem.shape, generator=torch.Generator().manual_seed(0)).double()
-    diagonal, others = group.diagonal.tolist(), group.beyond_diagonal()
+    diagonal, others = group.diagonal.tolist(), group.coset_representatives()
     assert len(diagonal) == count
     assert len(diagonal) * len(others) == len(group)
     assert_close(others[0].image(field), field, rtol=0, atol=0)

@@ -16,6 +16,7 @@ from dpl.inference import Simulator
 from dpl.models import ClosedFormFit, HasCorrection, Unrolled
 from dpl.models.unrolled.correction import choose_newton
 from dpl.models.unrolled.features import cell_gradients, rotated_strain, rotation, unbalanced_stress
+from dpl.models.unrolled.fit import modes_of_parity
 from dpl.models.unrolled.regression import MapParities, Rows, fit_map, weighted_error
 from dpl.scene import Sample, Scene
 from dpl.training import MSE, Surrogate
@@ -316,6 +317,17 @@ def test_fields_of_definite_parity(beam, net):
     for k, g in enumerate(parities.members.tolist()):
         factors = parities.characters[net.parity, k]
         assert torch.equal(group[g].image(fields), factors[:, None, None] * fields)
+
+
+def test_modes_are_the_best_of_all_images(beam, net):
+    free, random = beam.problem.free, torch.Generator().manual_seed(0)
+    snapshots = torch.randn(5, int(free.sum()), generator=random).double()
+    modes, _ = modes_of_parity(snapshots, net.group, free, 12)
+    assert modes.T @ modes == pytest.approx(torch.eye(12), abs=1e-6)
+    fields = scatter_fields(snapshots, free)
+    images = torch.cat([symmetry.image(fields)[:, free] for symmetry in net.group])
+    best = float(torch.linalg.svdvals(images).square()[:12].sum())
+    assert float((images @ modes).square().sum()) == pytest.approx(best, rel=1e-6)
 
 
 def test_the_fit_includes_newton_in_the_modes(beam, net):

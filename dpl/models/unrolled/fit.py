@@ -20,6 +20,7 @@ from dpl.scene import Sample
 
 CHUNK = 256  # samples whose fields or features are computed at a time
 SIZE_EXPONENT = -0.4  # errors count relative to the displacement to this power
+MAX_ROWS = 2**15  # samples and images to which maps are fitted
 MAX_BYTES = 2**31  # of snapshots and images from which modes are computed, in float32
 MIN_RANK = 40  # modes; fewer are not tried
 NOISE = 5e-7  # singular value over the largest below which a mode is rounding error
@@ -135,7 +136,7 @@ def modes_of_parity(
     """
     parities = Parities.of(group, free.shape[1])
     orbits = SignedOrbits.of_field(parities, group, free)
-    others = group.beyond_diagonal()
+    others = group.coset_representatives()
     count, size = len(snapshots) * len(others), snapshots.shape[1]
     some = snapshots[:: max(1, -(-4 * count * size // MAX_BYTES))]
     dtype = torch.float32 if len(some) * len(others) > MIN_SKETCH_SIZE else torch.float64
@@ -155,7 +156,7 @@ def modes_of_parity(
     value = torch.cat(values)
     order = value.argsort(descending=True, stable=True)[:rank]
     order = order[value[order] >= NOISE * value.max()]
-    return torch.cat(modes)[order].T.float().double(), torch.cat(numbers)[order]
+    return torch.cat(modes)[order].T.contiguous().float().double(), torch.cat(numbers)[order]
 
 
 def _chunks(samples: Sample) -> Iterator[Sample]:
@@ -360,8 +361,9 @@ def fit_in_best_modes(
     rests = [nonlinear_displacement(problem, part, linear) for part in both]
     weights = sample_weights(both[0].displacement[:, problem.free])
     every, parity = modes_of_parity(weights[:, None] * rests[0], group, problem.free, rank)
-    inverses = [symmetry.inverse for symmetry in group.beyond_diagonal()]
-    turned = [_image(every.T, one, problem.free).T for one in inverses]
+    inverses = [symmetry.inverse for symmetry in group.coset_representatives()]
+    few = inverses[: max(1, MAX_ROWS // len(rests[0]))]
+    turned = [_image(every.T, one, problem.free).T for one in few]
     fits: list[tuple[float, FittedBuffers]] = []
     count = every.shape[1]
     while count:
