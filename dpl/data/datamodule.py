@@ -13,7 +13,7 @@ from dpl.data.dataset import DataSet
 from dpl.data.samples import Samples
 from dpl.data.sources import MAX_COUNT, Source, Stored
 from dpl.fem import symmetries
-from dpl.fem.symmetry import Symmetry
+from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 
@@ -76,10 +76,10 @@ class DataModule(L.LightningDataModule):
         self._loaded: dict[str, tuple[int, Sample]] = {}  # with the number of loads tried
 
     @cached_property
-    def group(self) -> list[Symmetry]:
+    def group(self) -> SymmetryGroup:
         """Symmetries whose images are training samples; empty without `symmetry`."""
         if not self.symmetry:
-            return []
+            return NO_SYMMETRIES
         constant = self.scene.loads.constant_force
         return symmetries(self.scene.problem, also=[] if constant is None else [constant])
 

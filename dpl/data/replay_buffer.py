@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dpl.data.samples import transform
 from dpl.data.stream import SampleStream
-from dpl.fem.symmetry import Symmetry
+from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.scene import Sample, stack
 
 
@@ -64,7 +64,7 @@ class ReplayBuffer:
     reuse: int
     capacity: int
     seed: int = 0
-    group: Sequence[Symmetry] = ()
+    group: SymmetryGroup = NO_SYMMETRIES
     produced: int = field(default=0, init=False)
     next_index: int = field(default=0, init=False)
     rates: StreamRates | None = field(default=None, init=False)

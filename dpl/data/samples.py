@@ -1,19 +1,17 @@
 """Samples in memory, and their images under symmetries of their body."""
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from dpl.fem.symmetry import Symmetry, images
+from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.scene import Sample
 
 
 class Samples(Dataset):
     """Samples in memory and their images under symmetries, read a batch at a time."""
 
-    def __init__(self, samples: Sample, group: Sequence[Symmetry] = ()) -> None:
+    def __init__(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> None:
         """Store the samples, (B, ...), and the symmetries of their body, identity first."""
         self.samples = samples
         self.group = group
@@ -31,7 +29,7 @@ class Samples(Dataset):
         return transform(batch, self.group, torch.tensor([i // count for i in indices]))
 
 
-def transform(batch: Sample, group: Sequence[Symmetry], which: Tensor) -> Sample:
+def transform(batch: Sample, group: SymmetryGroup, which: Tensor) -> Sample:
     """Return samples transformed by symmetries of the body, `which` of them for each, (B,)."""
-    force, displacement = (images(field, group, which) for field in batch[:2])
+    force, displacement = (group.images(field, which) for field in batch[:2])
     return batch._replace(force=force, displacement=displacement)

@@ -10,13 +10,12 @@ Source: Bossavit (1986), Symmetry, groups, and boundary value problems, Comput. 
 Eng. 56.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from dpl.fem.symmetry import Symmetry
+from dpl.fem.symmetry import SymmetryGroup
 
 
 class Parities(NamedTuple):
@@ -34,41 +33,16 @@ class Parities(NamedTuple):
     characters: Tensor
 
     @classmethod
-    def of(cls, group: Sequence[Symmetry], dim: int) -> "Parities":
-        """Return the symmetries of a group; an empty group stands for the identity alone."""
-        rotations = torch.stack([one.rotation.cpu() for one in group] or [torch.eye(dim)]).double()
-        diagonals = rotations.diagonal(dim1=1, dim2=2)
-        diagonal = (torch.diag_embed(diagonals) == rotations).all(dim=2).all(dim=1)
-        members = diagonal.nonzero()[:, 0]
-        signs = diagonals[members]
+    def of(cls, group: SymmetryGroup, dim: int) -> Self:
+        """Return the symmetries of a group in D dimensions; an empty one is the identity alone."""
+        members = group.diagonal if group else torch.zeros(1, dtype=torch.int64)
+        rotations = group.rotations if group else torch.eye(dim, dtype=torch.float64)[None]
+        signs = rotations.diagonal(dim1=1, dim2=2)[members]
         bits = (signs < 0).double()
         every = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * dim).double()
         rows = (1 - 2 * ((every @ bits.T) % 2)).tolist()
         characters = torch.tensor(list(dict.fromkeys(map(tuple, rows))), dtype=torch.float64)
         return cls(members, signs, characters)
-
-    def adapted(self, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return an orthogonal matrix (R, R) to coordinates of definite parity, and parities (R,).
-
-        The order of coordinates is kept as far as possible.
-
-        Args:
-            actions: Matrix T of each symmetry, (M, R, R): an image has coordinates c T.
-        """
-        rank = actions.shape[1]
-        order = torch.arange(rank, 0, -1, dtype=torch.float64)
-        invariant = ((actions.mT * order) @ actions).mean(dim=0)
-        columns, values, parities = [], [], []
-        for p, factors in enumerate(self.characters):
-            projection = (factors[:, None, None] * actions).mean(dim=0)
-            shares, vectors = torch.linalg.eigh((projection + projection.T) / 2)
-            own = vectors[:, shares > 1 / 2]
-            sizes, axes = torch.linalg.eigh(own.T @ invariant @ own)
-            columns.append(own @ axes)
-            values.append(sizes)
-            parities.append(torch.full((own.shape[1],), p))
-        place = torch.cat(values).argsort(descending=True, stable=True)
-        return torch.cat(columns, dim=1)[:, place], torch.cat(parities)[place]
 
 
 class SignedOrbits(NamedTuple):
@@ -86,9 +60,7 @@ class SignedOrbits(NamedTuple):
     weight: Tensor
 
     @classmethod
-    def of_field(
-        cls, parities: Parities, group: Sequence[Symmetry], free: Tensor
-    ) -> "SignedOrbits":
+    def of_field(cls, parities: Parities, group: SymmetryGroup, free: Tensor) -> Self:
         """Return the orbits of the degrees of freedom of a mask (N, D), numbered in the mask."""
         nodes, dim = free.shape
         identity = torch.arange(nodes)
@@ -102,9 +74,7 @@ class SignedOrbits(NamedTuple):
         return cls(index, parities.signs[:, axis], 1 / stabiliser.double())
 
     @classmethod
-    def of_tensors(
-        cls, parities: Parities, positions: Tensor, count: int, width: int
-    ) -> "SignedOrbits":
+    def of_tensors(cls, parities: Parities, positions: Tensor, count: int, width: int) -> Self:
         """Return the orbits of `count` tensors (D, D) at each of C cells, in SIMD order.
 
         The values of an orbit are ordered by block of `width` cells, tensor and entry of a 3 x 3
@@ -139,42 +109,28 @@ class SignedOrbits(NamedTuple):
 
         return cls(in_blocks(index), in_blocks(sign), in_blocks(weight))
 
-    def without_filling(self) -> "SignedOrbits":
-        """Return the orbits without the values that only fill a block."""
-        used = self.weight > 0
-        return SignedOrbits(self.images[:, used], self.sign[:, used], self.weight[used])
-
-    def folded(self, values: Tensor, characters: Tensor) -> Tensor:
-        """Return values (m, r) whose products with b equal those of x with `unfolded(b)`.
-
-        Args:
-            values: x, (n, r).
-            characters: Factor of a parity under each symmetry, (M,).
-        """
-        result = torch.zeros(len(self.weight), values.shape[1]).to(values)
-        for factor, sign, index in zip(characters, self.sign, self.images, strict=True):
-            result += (factor * sign * self.weight)[:, None] * values[index]
-        unchanged = characters[:, None] * self.sign > 0
-        allowed = (unchanged | (self.images != self.images[0])).all(dim=0)
-        return torch.where(allowed[:, None], result, 0.0)  # also against rounding
-
     def by_parity(self, force: Tensor, parities: Parities) -> Tensor:
         """Return the products (M, m) of a force (n,) with the field of each orbit and parity."""
-        parts = [self.folded(force[:, None], characters) for characters in parities.characters]
-        return torch.cat(parts, dim=1).T
+        return torch.stack([self._products(force, one) for one in parities.characters])
 
-    def unfolded(self, values: Tensor, characters: Tensor, count: int) -> Tensor:
-        """Return columns (n, r) of a parity from one value of each orbit (m, r), n = `count`.
+    def coordinates(self, values: Tensor, characters: Tensor) -> Tensor:
+        """Return coordinates (..., m) of the parts of fields (..., n) of one parity.
+
+        The basis is orthonormal. It has one field for each orbit, which is zero, as is its
+        coordinate, where the parity allows no other value.
 
         Args:
-            values: One value of each orbit; zero where the parity allows no other.
+            values: The fields.
             characters: Factor of the parity under each symmetry, (M,).
-            count: n.
         """
-        result = values.new_zeros(count, values.shape[1])
-        parts = [characters.flip(0), self.sign.flip(0), self.images.flip(0)]
-        for factor, sign, index in zip(*parts, strict=True):
-            result[index] = (factor * sign)[:, None] * values
+        return self._products(values, characters) * self._scale(characters).to(values)
+
+    def fields(self, coordinates: Tensor, characters: Tensor, count: int) -> Tensor:
+        """Return fields (..., n) that have exactly one parity, n = `count`, see `coordinates`."""
+        scaled = coordinates * self._scale(characters).to(coordinates)
+        result = coordinates.new_zeros(*coordinates.shape[:-1], count)
+        for factor, sign, index in zip(characters, self.sign, self.images, strict=True):
+            result.index_add_(-1, index, scaled * (factor * sign * self.weight).to(scaled))
         return result
 
     def symmetrised(self, matrix: Tensor, parity: Tensor, parities: Parities) -> Tensor:
@@ -185,13 +141,30 @@ class SignedOrbits(NamedTuple):
             parity: Parity of each column, (R,).
             parities: The symmetries.
         """
-        result, used = torch.zeros_like(matrix), self.without_filling()
+        result = torch.zeros_like(matrix)
         for p, characters in enumerate(parities.characters):
-            own = (parity == p).nonzero()[:, 0]
-            mean = used.folded(matrix[:, own], characters) / used.weight[:, None]
-            mean /= len(characters)
-            result[:, own] = used.unfolded(mean, characters, len(matrix))
+            coordinates = self.coordinates(matrix.T[parity == p], characters)
+            result[:, parity == p] = self.fields(coordinates, characters, len(matrix)).T
         return result
+
+    def _products(self, values: Tensor, characters: Tensor) -> Tensor:
+        """Return products (..., m) of values (..., n) with the field of a parity of each orbit."""
+        rows = zip(characters, self.sign, self.images, strict=True)
+        products = sum(
+            (factor * sign * self.weight).to(values) * values[..., index]
+            for factor, sign, index in rows
+        )
+        return torch.where(self._allowed(characters), products, 0.0)  # also against rounding
+
+    def _allowed(self, characters: Tensor) -> Tensor:
+        """Return the mask (m,) of orbits whose values a parity allows to be other than zero."""
+        unchanged = characters[:, None] * self.sign > 0
+        return (unchanged | (self.images != self.images[0])).all(dim=0) & (self.weight > 0)
+
+    def _scale(self, characters: Tensor) -> Tensor:
+        """Return one over the norm of the field of a parity of each orbit, or 0, (m,)."""
+        squares = len(characters) * self.weight
+        return torch.where(self._allowed(characters), squares.rsqrt(), 0.0)
 
     def of_parity(self, matrix: Tensor, columns: Tensor) -> Tensor:
         """Return the rows of one value of each orbit in some columns, (m, r), of (n, R)."""

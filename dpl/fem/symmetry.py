@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -34,54 +34,77 @@ class Symmetry(NamedTuple):
     rotation: Tensor
     source: Tensor
 
+    @property
+    def inverse(self) -> "Symmetry":
+        """The symmetry that maps images back."""
+        return Symmetry(self.rotation.mT, self.source.argsort())
+
     def image(self, field: Tensor) -> Tensor:
         """Return the image (..., N, D) of a nodal field (..., N, D)."""
         return field[..., self.source, :] @ self.rotation.mT.to(field)
 
 
-def images(field: Tensor, group: Sequence[Symmetry], which: Tensor) -> Tensor:
-    """Return the images of nodal fields (B, N, D) under the members `which` (B,) of a group.
+class SymmetryGroup(tuple[Symmetry, ...]):
+    """The symmetries of a body, the identity first."""
 
-    The identity is the first member.
-    """
-    image = field.clone()
-    for k, symmetry in enumerate(group[1:], 1):
-        chosen = which == k
-        if chosen.any():
-            image[chosen] = symmetry.image(field[chosen])
-    return image
+    __slots__ = ()
+
+    @classmethod
+    def identity(cls, problem: Problem) -> Self:
+        """Return the group of the identity alone."""
+        (nodes, dim), device = problem.shape, problem.points.device
+        rotation = torch.eye(dim, dtype=torch.float64, device=device)
+        return cls([Symmetry(rotation, torch.arange(nodes, device=device))])
+
+    @property
+    def rotations(self) -> Tensor:
+        """Matrices Q of the members on the CPU, (G, D, D) [-]."""
+        return torch.stack([symmetry.rotation for symmetry in self]).cpu()
+
+    @property
+    def diagonal(self) -> Tensor:
+        """Numbers of the members with diagonal Q, a subgroup, (M,): reflections and half turns."""
+        Q = self.rotations
+        others = Q - torch.diag_embed(Q.diagonal(dim1=1, dim2=2))
+        return (~others.flatten(1).any(dim=1)).nonzero()[:, 0]
+
+    def coset_representatives(self) -> list[Symmetry]:
+        """Return one member g of each coset of `diagonal`, the identity first.
+
+        Each member of the group is a product h g with h in `diagonal`: first g, then h.
+        """
+        Q = self.rotations
+        products = (Q[self.diagonal][:, None] @ Q).flatten(2)
+        numbers = torch.cdist(products, Q.flatten(1)).argmin(dim=2)  # of h g, (M, G)
+        return [self[k] for k in numbers.amin(dim=0).unique().tolist()]
+
+    def images(self, field: Tensor, which: Tensor) -> Tensor:
+        """Return the images of nodal fields (B, N, D) under the members `which`, (B,)."""
+        image = field.clone()
+        for k, symmetry in enumerate(self[1:], 1):
+            chosen = which == k
+            if chosen.any():
+                image[chosen] = symmetry.image(field[chosen])
+        return image
+
+    def cell_images(self, problem: Problem) -> Tensor:
+        """Return the cell to which each member maps each cell of the body, (G, E) int64.
+
+        Cells are recognised by their set of nodes, as a sum of random numbers of the nodes.
+        """
+        cells = problem.cells.cpu()
+        random = torch.Generator().manual_seed(0)
+        names = torch.randint(2**62, (problem.shape[0],), generator=random)  # sums may wrap around
+        order = names[cells].sum(dim=1).sort()
+        nodes = (symmetry.source.cpu().argsort() for symmetry in self)
+        sums = torch.stack([names[node[cells]].sum(dim=1) for node in nodes])
+        return order.indices[torch.searchsorted(order.values, sums)]
 
 
-def products(group: Sequence[Symmetry]) -> Tensor:
-    """Return the multiplication table (G, G) int64 of a group; (1, 1) for an empty group."""
-    if not group:
-        return torch.zeros(1, 1, dtype=torch.int64)
-    Q = torch.stack([symmetry.rotation for symmetry in group]).cpu()
-    every = Q[None] @ Q[:, None]  # first i, then j
-    return (every[:, :, None] - Q).flatten(3).norm(dim=3).argmin(dim=2)
+NO_SYMMETRIES = SymmetryGroup()  # samples have no images
 
 
-def cell_images(problem: Problem, group: Sequence[Symmetry]) -> Tensor:
-    """Return the cell to which each symmetry maps each cell, (G, E) int64; (1, E) without a group.
-
-    Cells are recognised by their set of nodes, as a sum of random numbers of the nodes.
-    """
-    cells = problem.cells.cpu()
-    if not group:
-        return torch.arange(len(cells))[None]
-    random = torch.Generator().manual_seed(0)
-    names = torch.randint(2**62, (problem.shape[0],), generator=random)  # sums may wrap around
-    order = names[cells].sum(dim=1).sort()
-    images = []
-    for symmetry in group:
-        node = torch.empty_like(symmetry.source).cpu()
-        node[symmetry.source.cpu()] = torch.arange(len(node))
-        found = torch.searchsorted(order.values, names[node[cells]].sum(dim=1))
-        images.append(order.indices[found])
-    return torch.stack(images)
-
-
-def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetry]:
+def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> SymmetryGroup:
     """Return the symmetry group of a body in a reproducible order, the identity first.
 
     A symmetry maps nodes to nodes and commutes with the boundary conditions and with the internal
@@ -104,10 +127,9 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetr
         )
 
     motions = _motions(points, np.count_nonzero(problem.free.cpu().numpy(), axis=1))
-    one = torch.eye(points.shape[1], dtype=torch.float64), torch.arange(len(points))
-    moved = [Symmetry(*(part.to(fields.device) for part in pair)) for pair in (*motions, one)]
-    found = list(filter(holds, moved[:-1])) or moved[-1:]
-    return sorted(_closed(found), key=lambda symmetry: symmetry.source.tolist())
+    moved = [Symmetry(*(part.to(fields.device) for part in pair)) for pair in motions]
+    found = list(filter(holds, moved)) or SymmetryGroup.identity(problem)
+    return SymmetryGroup(sorted(_closed(found), key=lambda symmetry: symmetry.source.tolist()))
 
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:

@@ -24,7 +24,7 @@ from dpl.fem.rom.stiffness_iteration import StiffnessIteration, TermMatrices, no
 from dpl.fem.solvers.condensed_layers import CondensedLayers
 from dpl.fem.solvers.parity_factor import OrbitForm
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
-from dpl.fem.symmetry import Symmetry
+from dpl.fem.symmetry import SymmetryGroup
 from dpl.models.precision import full_precision
 from dpl.scene import Scene
 from dpl.system.threads import on_threads
@@ -49,7 +49,7 @@ class LinearResponse:
     The blocks depend on the scene only and are computed when they are first used.
     """
 
-    def __init__(self, scene: Scene, group: list[Symmetry]) -> None:
+    def __init__(self, scene: Scene, group: SymmetryGroup) -> None:
         """Take the scene and the symmetries of the body.
 
         Raises:

@@ -1,6 +1,5 @@
 """Samples with their linear solutions, which are computed once for a data set."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -8,7 +7,7 @@ from torch import Tensor
 
 from dpl.data.datamodule import Samples
 from dpl.fem import Load
-from dpl.fem.symmetry import Symmetry, images
+from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.models.linear_base import LinearBase
 from dpl.scene import Sample
 
@@ -30,7 +29,9 @@ class LinearBatch(NamedTuple):
 class LinearSamples(Samples):
     """Samples in memory with their linear solutions, and images of both under symmetries."""
 
-    def __init__(self, samples: Sample, base: LinearBase, group: Sequence[Symmetry] = ()) -> None:
+    def __init__(
+        self, samples: Sample, base: LinearBase, group: SymmetryGroup = NO_SYMMETRIES
+    ) -> None:
         """Compute the linear solutions.
 
         Args:
@@ -46,7 +47,7 @@ class LinearSamples(Samples):
         count = len(self.linear)
         linear = self.linear[[i % count for i in indices]].double()
         if self.group:
-            linear = images(linear, self.group, torch.tensor([i // count for i in indices]))
+            linear = self.group.images(linear, torch.tensor([i // count for i in indices]))
         return LinearBatch(linear.float(), super().__getitems__(indices))
 
 

@@ -3,7 +3,7 @@
 A predictor is the only border between float64 mechanics and a float32 network.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, Self, cast
 
 import torch
@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 
 from dpl.data.samples import Samples
 from dpl.fem import Load
-from dpl.fem.symmetry import Symmetry, images
+from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.models.inputs import Base, Inputs
 from dpl.models.linear_base import LinearBase, sampled_solutions
 from dpl.models.protocols import HasBases
@@ -58,7 +58,7 @@ class Predictor(StoredBuffers):
         """Return the displacements of a batch of `dataset`, and its samples."""
         return self(batch.load), batch
 
-    def dataset(self, samples: Sample, group: Sequence[Symmetry] = ()) -> Dataset:
+    def dataset(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
         """Return what the predictor is trained on: samples and their images.
 
         Args:
@@ -76,13 +76,13 @@ class Predictor(StoredBuffers):
         """True for a network that `HasBases` before they are computed."""
         return hasattr(self.net, "fit_bases") and not cast(HasBases, self.net).is_fitted
 
-    def fit_bases(self, samples: Sample, group: Sequence[Symmetry] = ()) -> None:
+    def fit_bases(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> None:
         """Let the network compute its bases from samples (S, N, D) and their images."""
         members = range(max(1, len(group)))
         stride = -(-len(samples.force) * len(members) // MAX_SNAPSHOTS)
         few = Sample(*(column[::stride].to(self.force_scale.device) for column in samples))
         which = [torch.full((len(few.force),), k) for k in members]
-        fields = (torch.cat([images(part, group, k) for k in which]) for part in self.examples(few))
+        fields = (torch.cat([group.images(part, k) for k in which]) for part in self.examples(few))
         cast(HasBases, self.net).fit_bases(*fields)
 
     def scalars(self, load: Load, *computed: Tensor) -> Tensor:
@@ -235,7 +235,7 @@ class OnLinearSolution(Predictor):
             return self(batch.sample.load, batch.linear), batch.sample
         return self(batch.load), batch
 
-    def dataset(self, samples: Sample, group: Sequence[Symmetry] = ()) -> Dataset:
+    def dataset(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
         """Return samples with their linear solutions, which are computed once."""
         return LinearSamples(samples, self.base, group)
 

@@ -1,6 +1,6 @@
 """The LightningModule: a predictor with loss, metrics and optimiser."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Self, cast
 
 import lightning as L
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from dpl.fem import Load
-from dpl.fem.symmetry import Symmetry
+from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.models.inputs import Base, Inputs
 from dpl.models.linear_base import SCALE_STREAM
 from dpl.scene import Sample, Scene
@@ -119,7 +119,7 @@ class Surrogate(L.LightningModule):
         """Return the work that network and loss save, one line each."""
         return [*self.predictor.skipped_work(), *self.loss.skipped_work()]
 
-    def encode(self, samples: Sample, group: Sequence[Symmetry] = ()) -> Dataset:
+    def encode(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
         """Return what the network is trained on, see `Predictor.dataset`."""
         return self.predictor.dataset(samples, group)
 
@@ -148,7 +148,7 @@ class Surrogate(L.LightningModule):
             data = self.trainer.datamodule
             self.fit_bases(data.snapshots(), data.group)
 
-    def fit_bases(self, samples: Sample, group: Sequence[Symmetry] = ()) -> None:
+    def fit_bases(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> None:
         """Fit the bases of a network that `HasBases` to samples (S, N, D) and their images."""
         self.predictor.fit_bases(samples, group)
 

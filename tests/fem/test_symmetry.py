@@ -10,44 +10,27 @@ import skfem
 import torch
 from torch.testing import assert_close
 
-from dpl.fem import (
-    Box,
-    DirichletBC,
-    LinearElastic,
-    LinearSolver,
-    Load,
-    Material,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    RobinBC,
-    Tag,
-    Traction,
-    box,
-    propeller,
-    rectangle,
-    solve,
-    symmetries,
-)
-from dpl.fem.symmetry import products
+from dpl import fem
+from dpl.fem.parity import Parities, SignedOrbits
+from dpl.fem.rom.pod import scatter_fields
 
-NH = NeoHookeanLn(0.3)
-LEFT, RIGHT = Plane(0, "min"), Plane(0, "max")
-CUBE = box([1.0, 1.0, 1.0], [4, 4, 4])
-BEAM = box([100.0, 25.0, 25.0], [9, 4, 4])
+NH = fem.NeoHookeanLn(0.3)
+LEFT, RIGHT = fem.Plane(0, "min"), fem.Plane(0, "max")
+CUBE = fem.box([1.0, 1.0, 1.0], [4, 4, 4])
+BEAM = fem.box([100.0, 25.0, 25.0], [9, 4, 4])
+PLATE = fem.rectangle([100.0, 25.0], [9, 4])
+COARSE = [1, 1, 1, 2, 3]  # cells of a propeller
 BODIES = {  # mesh, what is held, order of the group
     "beam of square section": (BEAM, LEFT, 8),
-    "beam of rectangular section": (box([100.0, 25.0, 10.0], [9, 4, 3]), LEFT, 4),
-    "beam of square section, unequal cells": (box([100.0, 25.0, 25.0], [9, 4, 3]), LEFT, 4),
-    "cantilever": (rectangle([100.0, 25.0], [17, 5]), LEFT, 2),
-    "cantilever of triangles": (rectangle([100.0, 25.0], [17, 5], "triangle"), LEFT, 1),
+    "beam of rectangular section": (fem.box([100.0, 25.0, 10.0], [9, 4, 3]), LEFT, 4),
+    "beam of square section, unequal cells": (fem.box([100.0, 25.0, 25.0], [9, 4, 3]), LEFT, 4),
+    "cantilever": (fem.rectangle([100.0, 25.0], [17, 5]), LEFT, 2),
+    "cantilever of triangles": (fem.rectangle([100.0, 25.0], [17, 5], "triangle"), LEFT, 1),
     "free cube": (CUBE, None, 48),
-    "free square": (rectangle([1.0, 1.0], [4, 4]), None, 8),
-    "free square of triangles": (rectangle([1.0, 1.0], [4, 4], "triangle"), None, 4),
-    "free cube of tetrahedra": (box([1.0, 1.0, 1.0], [4, 4, 4], "tetra"), None, 12),
-    "beam of tetrahedra": (box([100.0, 25.0, 25.0], [9, 4, 4], "tetra"), LEFT, 2),
+    "free square": (fem.rectangle([1.0, 1.0], [4, 4]), None, 8),
+    "free square of triangles": (fem.rectangle([1.0, 1.0], [4, 4], "triangle"), None, 4),
+    "free cube of tetrahedra": (fem.box([1.0, 1.0, 1.0], [4, 4, 4], "tetra"), None, 12),
+    "beam of tetrahedra": (fem.box([100.0, 25.0, 25.0], [9, 4, 4], "tetra"), LEFT, 2),
     "free cube of five tetrahedra": (skfem.MeshTet(), None, 24),
     "corner of a cube": (skfem.MeshTet.init_refdom(), None, 6),
 }
@@ -68,16 +51,16 @@ def ring(corners: int) -> skfem.Mesh:
 
 
 @pytest.fixture(params=BODIES)
-def body(request) -> tuple[Problem, int]:
+def body(request) -> tuple[fem.Problem, int]:
     """Each of the bodies, and the order of its group."""
     mesh, fixed, order = BODIES[request.param]
-    return Problem.build(mesh, NH, fixed=fixed), order
+    return fem.Problem.build(mesh, NH, fixed=fixed), order
 
 
 @pytest.fixture(scope="module")
-def solver() -> Newton:
+def solver() -> fem.Newton:
     """The beam with eight symmetries."""
-    return Newton(Problem.build(BEAM, NH, fixed=LEFT), linear="superlu")
+    return fem.Newton(fem.Problem.build(BEAM, NH, fixed=LEFT), linear="superlu")
 
 
 def check_group(group):
@@ -96,12 +79,12 @@ def check_group(group):
 
 def test_every_symmetry_of_a_body_is_found(body):
     problem, order = body
-    assert len(symmetries(problem)) == order
+    assert len(fem.symmetries(problem)) == order
 
 
 def test_symmetries_are_a_group_that_starts_with_the_identity(body, bend):
     problem, _ = body
-    group = symmetries(problem)
+    group = fem.symmetries(problem)
     check_group(group)
     assert torch.equal(group[0].rotation, torch.eye(problem.shape[1], dtype=torch.float64))
     assert group[0].source.tolist() == list(range(problem.shape[0]))
@@ -112,7 +95,7 @@ def test_symmetries_are_a_group_that_starts_with_the_identity(body, bend):
 def test_symmetries_map_nodes_by_the_matrix_that_rotates_vectors(body):
     problem, _ = body
     points = problem.points - problem.points.mean(dim=0)
-    for symmetry in symmetries(problem):
+    for symmetry in fem.symmetries(problem):
         assert_close(symmetry.image(points), points, rtol=0, atol=1e-14)
 
 
@@ -120,7 +103,7 @@ def test_energy_force_and_volume_ratio_are_those_of_the_image(body, bend):
     problem, _ = body
     u = bend(problem.points, 2, seed=5)
     internal, volume = problem.evaluate(u)
-    for symmetry in symmetries(problem):
+    for symmetry in fem.symmetries(problem):
         image = problem.evaluate(symmetry.image(u))
         assert_close(problem.energy(symmetry.image(u)), problem.energy(u), rtol=1e-12, atol=0)
         assert_close(image.internal, symmetry.image(internal), rtol=0, atol=1e-13)
@@ -129,7 +112,7 @@ def test_energy_force_and_volume_ratio_are_those_of_the_image(body, bend):
 
 def test_all_signed_permutations_that_keep_the_cells_are_found():
     """Counted another way: on the nodes' whole numbers, and without any mechanics."""
-    mesh = box([3.0, 3.0, 3.0], [4, 4, 4], "tetra")
+    mesh = fem.box([3.0, 3.0, 3.0], [4, 4, 4], "tetra")
     grid = {tuple(point): node for node, point in enumerate(mesh.p.T.round().astype(int))}
     cells = {frozenset(cell) for cell in mesh.t.T.tolist()}
     kept = set()
@@ -140,15 +123,12 @@ def test_all_signed_permutations_that_keep_the_cells_are_found():
             node = [grid[tuple(point)] for point in moved]
             if {frozenset(node[i] for i in cell) for cell in cells} == cells:
                 kept.add(tuple(Q.ravel()))
-    found = symmetries(Problem.build(mesh, NH))
+    found = fem.symmetries(fem.Problem.build(mesh, NH))
     assert {tuple(symmetry.rotation.flatten().tolist()) for symmetry in found} == kept
 
 
-def test_the_beam_of_the_paper_has_eight_symmetries():
-    """Of its square section: four turns, four mirrors."""
-    mesh = box([100.0, 25.0, 25.0], [40, 10, 10])
-    group = symmetries(Problem.build(mesh, NH, fixed=LEFT))
-    assert len(group) == 8
+def test_a_square_section_has_four_turns_and_four_mirrors(solver):
+    group = fem.symmetries(solver.problem)
     assert sum(torch.det(symmetry.rotation) < 0 for symmetry in group) == 4
     assert all((symmetry.rotation == symmetry.rotation.round()).all() for symmetry in group)
 
@@ -156,7 +136,9 @@ def test_the_beam_of_the_paper_has_eight_symmetries():
 @pytest.mark.parametrize("blades", [2, 3, 5])
 def test_a_propeller_has_two_rotations_per_blade_and_no_reflection(blades):
     """About the shaft, and by half a turn about each blade, whose sections look the same."""
-    group = symmetries(Problem.build(propeller(blades=blades), NH, fixed=Tag("bore")))
+    group = fem.symmetries(
+        fem.Problem.build(fem.propeller(blades=blades), NH, fixed=fem.Tag("bore"))
+    )
     assert len(group) == 2 * blades
     assert all(torch.det(symmetry.rotation) > 0 for symmetry in group)
     about_the_shaft = [s for s in group if s.rotation[0, 0] > 0]
@@ -166,28 +148,75 @@ def test_a_propeller_has_two_rotations_per_blade_and_no_reflection(blades):
 
 @pytest.mark.parametrize("corners", [4, 5, 7, 12])
 def test_rotations_and_reflections_of_rings_are_found_in_every_orientation(corners):
-    group = symmetries(Problem.build(ring(corners), NH))
+    group = fem.symmetries(fem.Problem.build(ring(corners), NH))
     assert len(group) == 4 * corners
     check_group(group)
 
 
-@pytest.mark.parametrize("mesh", [CUBE, propeller()], ids=["cube", "propeller"])
-def test_products_are_the_members_that_compose_two_images(mesh):
-    problem = Problem.build(mesh, NH, fixed=None if mesh is CUBE else Tag("bore"))
-    group = symmetries(problem)
-    table, every = products(group), torch.arange(len(group))
+PROPELLER = fem.propeller(cells=COARSE)
+FEW = pytest.mark.parametrize(
+    ("mesh", "fixed", "count"),
+    [(BEAM, LEFT, 4), (PROPELLER, fem.Tag("bore"), 2), (CUBE, None, 8), (PLATE, LEFT, 2)],
+    ids=["beam", "propeller", "cube", "plate"],
+)
+
+
+@FEW
+def test_reflections_and_one_member_of_each_coset_compose_all_members(mesh, fixed, count):
+    problem = fem.Problem.build(mesh, NH, fixed=fixed)
+    group = fem.symmetries(problem)
     field = torch.randn(problem.shape, generator=torch.Generator().manual_seed(0)).double()
-    for i, j in [(0, 1), (1, 0), (1, 2), (2, 1), (3, 5), (5, 3), (4, 4)]:
-        both = group[j].image(group[i].image(field))
-        assert_close(both, group[int(table[i, j])].image(field), rtol=0, atol=1e-9)
-    assert torch.equal(table[0], every), "the identity first"
-    for row in (*table, *table.T):
-        assert torch.equal(row.sort().values, every)
-    assert not torch.equal(table, table.T), "order matters"
+    diagonal, others = group.diagonal.tolist(), group.coset_representatives()
+    assert len(diagonal) == count
+    assert len(diagonal) * len(others) == len(group)
+    assert_close(others[0].image(field), field, rtol=0, atol=0)
+    products = torch.stack([group[h].image(g.image(field)) for h in diagonal for g in others])
+    for symmetry in group:
+        assert (products - symmetry.image(field)).abs().amax(dim=(1, 2)).min() < 1e-9
 
 
-def test_without_a_group_the_only_product_is_the_identity():
-    assert products([]).tolist() == [[0]]
+@FEW
+def test_cells_are_mapped_like_their_centres(mesh, fixed, count):
+    problem = fem.Problem.build(mesh, NH, fixed=fixed)
+    group = fem.symmetries(problem)
+    centres = (problem.points - problem.points.mean(dim=0))[problem.cells].mean(dim=1)
+    for symmetry, image in zip(group, group.cell_images(problem), strict=True):
+        assert_close(centres[image], centres @ symmetry.rotation.T, rtol=0, atol=1e-9)
+
+
+@FEW
+def test_fields_are_the_sums_of_their_parts_of_definite_parity(mesh, fixed, count):
+    """The parts are orthogonal; reflections multiply them by exactly 1 or -1."""
+    problem = fem.Problem.build(mesh, NH, fixed=fixed)
+    group, free, dim = fem.symmetries(problem), problem.free, problem.shape[1]
+    parities, size = Parities.of(group, dim), int(free.sum())
+    assert_close(parities.characters.T @ parities.characters, count * torch.eye(count).double())
+    orbits = SignedOrbits.of_field(parities, group, free)
+    values = torch.randn(2, size, generator=torch.Generator().manual_seed(0)).double()
+    total, squares = torch.zeros(2, size).double(), torch.zeros(2).double()
+    for characters in parities.characters:
+        coordinates = orbits.coordinates(values, characters)
+        part = orbits.fields(coordinates, characters, size)
+        total, squares = total + part, squares + coordinates.square().sum(dim=1)
+        field = scatter_fields(part, free)
+        for number, factor in zip(parities.members.tolist(), characters, strict=True):
+            assert torch.equal(group[number].image(field), factor * field)
+    assert_close(total, values, rtol=0, atol=1e-13)
+    assert_close(squares, values.square().sum(dim=1))
+
+
+def test_the_inverse_maps_images_back(solver, bend):
+    field = bend(solver.problem.points)
+    for symmetry in fem.symmetries(solver.problem):
+        assert_close(symmetry.inverse.image(symmetry.image(field)), field, rtol=0, atol=1e-14)
+
+
+def test_a_batch_has_an_image_under_a_member_for_each_field(solver):
+    group = fem.symmetries(solver.problem)
+    fields = torch.randn(3, *solver.problem.shape, generator=torch.Generator()).double()
+    which = torch.tensor([5, 0, 2])
+    expected = [group[k].image(field) for k, field in zip(which.tolist(), fields, strict=True)]
+    assert torch.equal(group.images(fields, which), torch.stack(expected))
 
 
 def test_neither_size_nor_place_nor_numbering_matters():
@@ -197,48 +226,48 @@ def test_neither_size_nor_place_nor_numbering_matters():
         BEAM.translated((500.0, -300.0, 200.0)),
         type(BEAM)(BEAM.p[:, np.argsort(shuffled)], shuffled[BEAM.t]),
     ):
-        assert len(symmetries(Problem.build(mesh, NH, fixed=LEFT))) == 8
+        assert len(fem.symmetries(fem.Problem.build(mesh, NH, fixed=LEFT))) == 8
 
 
 @pytest.mark.parametrize("shaken", [1e-8, 1e-3, 0.1])
 def test_distorted_meshes_have_the_identity_only(grid, kind, shaken):
     """Shaken by 1e-8 the nodes look symmetric, but images of answers would not be exact."""
-    problem = Problem.build(grid(kind[0], 2, shaken), NH, fixed=None, degree=kind[1])
-    assert len(symmetries(problem)) == 1
+    problem = fem.Problem.build(grid(kind[0], 2, shaken), NH, fixed=None, degree=kind[1])
+    assert len(fem.symmetries(problem)) == 1
 
 
 def test_a_sheared_beam_has_no_symmetry():
     shear = np.array([[1.0, 0.3, 0.2], [0.0, 1.0, 0.1], [0.0, 0.0, 1.0]])
     mesh = type(BEAM)(shear @ BEAM.p, BEAM.t)
-    assert len(symmetries(Problem.build(mesh, NH, fixed=BEAM.p[0] == 0))) == 1
-    assert len(symmetries(Problem.build(mesh, NH))) == 2  # the point reflection
+    assert len(fem.symmetries(fem.Problem.build(mesh, NH, fixed=BEAM.p[0] == 0))) == 1
+    assert len(fem.symmetries(fem.Problem.build(mesh, NH))) == 2  # the point reflection
 
 
 @pytest.mark.parametrize("degree", [1, 2])
 def test_degree_does_not_matter(degree):
     for cell, order in (("hexahedron", 8), ("tetra", 2)):
-        mesh = box([100.0, 25.0, 25.0], [5, 3, 3], cell)
-        problem = Problem.build(mesh, NH, fixed=LEFT, degree=degree)
-        assert len(symmetries(problem)) == order
-    mesh = rectangle([100.0, 25.0], [9, 3])
-    assert len(symmetries(Problem.build(mesh, NH, fixed=LEFT, degree=degree))) == 2
+        mesh = fem.box([100.0, 25.0, 25.0], [5, 3, 3], cell)
+        problem = fem.Problem.build(mesh, NH, fixed=LEFT, degree=degree)
+        assert len(fem.symmetries(problem)) == order
+    mesh = fem.rectangle([100.0, 25.0], [9, 3])
+    assert len(fem.symmetries(fem.Problem.build(mesh, NH, fixed=LEFT, degree=degree))) == 2
 
 
 @pytest.mark.parametrize("mean", [False, True])
 def test_isotropic_laws_do_not_matter(isotropic_law, mean):
-    mesh = box([4.0, 1.0, 1.0], [5, 3, 3])
-    problem = Problem.build(mesh, isotropic_law, fixed=LEFT, mean_dilatation=mean)
-    assert len(symmetries(problem)) == 8
+    mesh = fem.box([4.0, 1.0, 1.0], [5, 3, 3])
+    problem = fem.Problem.build(mesh, isotropic_law, fixed=LEFT, mean_dilatation=mean)
+    assert len(fem.symmetries(problem)) == 8
 
 
 def test_no_law_fails_on_motions_that_are_no_symmetries(isotropic_law):
     """Nodes that are symmetric and cells that are not: images of displacements fold the cells."""
-    mesh = box([4.0, 1.0, 1.0], [5, 3, 3], "tetra")
-    assert len(symmetries(Problem.build(mesh, isotropic_law, fixed=LEFT))) == 2
+    mesh = fem.box([4.0, 1.0, 1.0], [5, 3, 3], "tetra")
+    assert len(fem.symmetries(fem.Problem.build(mesh, isotropic_law, fixed=LEFT))) == 2
 
 
 @dataclass(frozen=True)
-class Fibred(Material):
+class Fibred(fem.Material):
     """Neo-Hookean solid with fibres along the direction (0, 1, 0)."""
 
     def energy(self, H):
@@ -248,7 +277,9 @@ class Fibred(Material):
 
 
 def test_fibres_across_the_beam_leave_half_of_its_symmetries():
-    group = symmetries(Problem.build(box([4.0, 1.0, 1.0], [5, 3, 3]), Fibred(), fixed=LEFT))
+    group = fem.symmetries(
+        fem.Problem.build(fem.box([4.0, 1.0, 1.0], [5, 3, 3]), Fibred(), fixed=LEFT)
+    )
     assert len(group) == 4
     assert all(symmetry.rotation[1, 1].abs() == 1 for symmetry in group)
 
@@ -256,47 +287,49 @@ def test_fibres_across_the_beam_leave_half_of_its_symmetries():
 @pytest.mark.parametrize(
     ("supports", "order"),
     [
-        ([DirichletBC(LEFT)], 8),
-        ([DirichletBC(LEFT), DirichletBC(RIGHT)], 16),
-        ([DirichletBC(Box([0, 0, 0], [0, 0, 1]))], 4),  # an edge: its two mirrors
-        ([DirichletBC(Box([0, 0, 0], [0, 0, 0]))], 6),  # a corner: turns about the diagonal
-        ([DirichletBC(LEFT, [0.0, None, None])], 8),
-        ([DirichletBC(LEFT, [None, 0.0, None])], 4),
+        ([fem.DirichletBC(LEFT)], 8),
+        ([fem.DirichletBC(LEFT), fem.DirichletBC(RIGHT)], 16),
+        ([fem.DirichletBC(fem.Box([0, 0, 0], [0, 0, 1]))], 4),  # an edge: its two mirrors
+        ([fem.DirichletBC(fem.Box([0, 0, 0], [0, 0, 0]))], 6),  # a corner: turns about the diagonal
+        ([fem.DirichletBC(LEFT, [0.0, None, None])], 8),
+        ([fem.DirichletBC(LEFT, [None, 0.0, None])], 4),
         (
             [
-                DirichletBC(Plane(axis, "min"), np.where(np.eye(3)[axis], 0, None))
+                fem.DirichletBC(fem.Plane(axis, "min"), np.where(np.eye(3)[axis], 0, None))
                 for axis in (0, 1)
             ],
             4,
         ),
-        ([DirichletBC(LEFT), DirichletBC(RIGHT, [0.1, None, None])], 8),
-        ([DirichletBC(LEFT), DirichletBC(RIGHT, [-0.1, 0.0, 0.0])], 8),
-        ([DirichletBC(LEFT), DirichletBC(RIGHT, [0.1, 0.0, 1e-6])], 2),
-        ([DirichletBC(LEFT, [-0.1, 0, 0]), DirichletBC(RIGHT, [0.1, 0, 0])], 16),
-        ([DirichletBC(LEFT), RobinBC(RIGHT, 0.1)], 8),
-        ([DirichletBC(LEFT), RobinBC(RIGHT, [0.1, 0.2, 0.2])], 8),
-        ([DirichletBC(LEFT), RobinBC(RIGHT, [0.1, 0.2, 0.3])], 4),
-        ([DirichletBC(LEFT), RobinBC(Plane(1, "max"), 1e-13)], 2),
-        ([DirichletBC(LEFT), RobinBC(Plane(1, "max"), 1e13)], 2),
+        ([fem.DirichletBC(LEFT), fem.DirichletBC(RIGHT, [0.1, None, None])], 8),
+        ([fem.DirichletBC(LEFT), fem.DirichletBC(RIGHT, [-0.1, 0.0, 0.0])], 8),
+        ([fem.DirichletBC(LEFT), fem.DirichletBC(RIGHT, [0.1, 0.0, 1e-6])], 2),
+        ([fem.DirichletBC(LEFT, [-0.1, 0, 0]), fem.DirichletBC(RIGHT, [0.1, 0, 0])], 16),
+        ([fem.DirichletBC(LEFT), fem.RobinBC(RIGHT, 0.1)], 8),
+        ([fem.DirichletBC(LEFT), fem.RobinBC(RIGHT, [0.1, 0.2, 0.2])], 8),
+        ([fem.DirichletBC(LEFT), fem.RobinBC(RIGHT, [0.1, 0.2, 0.3])], 4),
+        ([fem.DirichletBC(LEFT), fem.RobinBC(fem.Plane(1, "max"), 1e-13)], 2),
+        ([fem.DirichletBC(LEFT), fem.RobinBC(fem.Plane(1, "max"), 1e13)], 2),
     ],
 )
 def test_boundary_conditions_reduce_the_group_to_their_symmetries(supports, order):
     """A cube, whose nodes and cells have 48 symmetries."""
-    group = symmetries(Problem.build(CUBE, NH, supports=supports))
+    group = fem.symmetries(fem.Problem.build(CUBE, NH, supports=supports))
     assert len(group) == order
     check_group(group)
 
 
 def test_very_stiff_springs_do_not_hide_the_cells():
-    mesh = box([1.0, 1.0, 1.0], [4, 4, 4], "tetra")
-    springs = [RobinBC(Plane(axis, side), 1e13) for axis in range(3) for side in ("min", "max")]
-    assert len(symmetries(Problem.build(mesh, NH, supports=springs))) == 12
+    mesh = fem.box([1.0, 1.0, 1.0], [4, 4, 4], "tetra")
+    springs = [
+        fem.RobinBC(fem.Plane(axis, side), 1e13) for axis in range(3) for side in ("min", "max")
+    ]
+    assert len(fem.symmetries(fem.Problem.build(mesh, NH, supports=springs))) == 12
 
 
 def test_constant_forces_reduce_the_group_to_their_symmetries(solver):
     problem = solver.problem
     stretch, sag, twist = (
-        Traction(RIGHT, value).on(problem)
+        fem.Traction(RIGHT, value).on(problem)
         for value in ([0.1, 0.0, 0.0], [0.0, 0.0, -0.1], [0.1, 0.2, 0.3])
     )
     none = torch.zeros(problem.shape, dtype=torch.float64)
@@ -308,7 +341,7 @@ def test_constant_forces_reduce_the_group_to_their_symmetries(solver):
         ([twist], 1),
         ([stretch + 1e-6 * sag], 2),
     ):
-        group = symmetries(problem, also=also)
+        group = fem.symmetries(problem, also=also)
         assert len(group) == order
         for symmetry, force in itertools.product(group, also):
             assert_close(symmetry.image(force), force, rtol=0, atol=1e-13)
@@ -316,11 +349,11 @@ def test_constant_forces_reduce_the_group_to_their_symmetries(solver):
 
 def test_images_of_solutions_are_solutions_of_the_images_of_their_loads(solver):
     problem = solver.problem
-    load = ModalLoads(solver.linear_solver, n_modes=5).sample(0, range(4))
-    load = Load(load.force * torch.tensor([1.0, 1.0, 1e-3, 1e-6])[:, None, None], load.young)
-    answer = solve(solver, load)
+    load = fem.ModalLoads(solver.linear_solver, n_modes=5).sample(0, range(4))
+    load = fem.Load(load.force * torch.tensor([1.0, 1.0, 1e-3, 1e-6])[:, None, None], load.young)
+    answer = fem.solve(solver, load)
     assert answer.converged.all()
-    for symmetry in symmetries(problem):
+    for symmetry in fem.symmetries(problem):
         image, force = symmetry.image(answer.displacement), symmetry.image(load.force)
         ratio = problem.relative_residual(image, force)
         assert (ratio < 1e-8).all()
@@ -332,15 +365,15 @@ def test_images_of_solutions_are_solutions_of_the_images_of_their_loads(solver):
 @pytest.mark.parametrize("mean", [False, True])
 def test_images_of_solutions_with_moved_supports_and_springs_are_solutions(law, mean):
     supports = [
-        DirichletBC(LEFT),
-        DirichletBC(RIGHT, [0.1, None, None]),
-        RobinBC(Plane(2, "min"), 0.3),
+        fem.DirichletBC(LEFT),
+        fem.DirichletBC(RIGHT, [0.1, None, None]),
+        fem.RobinBC(fem.Plane(2, "min"), 0.3),
     ]
-    problem = Problem.build(CUBE, law, supports=supports, mean_dilatation=mean)
-    force = Traction(Plane(1, "max"), [0.01, -0.03, 0.02]).on(problem)
-    answer = solve(Newton(problem, linear="superlu"), Load(force[None], torch.ones(1)))
+    problem = fem.Problem.build(CUBE, law, supports=supports, mean_dilatation=mean)
+    force = fem.Traction(fem.Plane(1, "max"), [0.01, -0.03, 0.02]).on(problem)
+    answer = fem.solve(fem.Newton(problem, linear="superlu"), fem.Load(force[None], torch.ones(1)))
     assert answer.converged.all()
-    group = symmetries(problem)
+    group = fem.symmetries(problem)
     assert len(group) == 2
     for symmetry in group:
         image = symmetry.image(answer.displacement)
@@ -350,10 +383,10 @@ def test_images_of_solutions_with_moved_supports_and_springs_are_solutions(law, 
 
 def test_linear_solutions_are_mapped_with_their_loads(solver, bend):
     problem = solver.problem
-    linear = LinearSolver(problem, linear="superlu")
+    linear = fem.LinearSolver(problem, linear="superlu")
     force = torch.where(problem.free, bend(problem.points)[0], 0.0)
     answer = linear.solve(force)
-    for symmetry in symmetries(problem):
+    for symmetry in fem.symmetries(problem):
         expected = symmetry.image(answer)
         found = linear.solve(symmetry.image(force))
         assert (found - expected).abs().max() < 1e-10 * expected.abs().max()
@@ -362,7 +395,7 @@ def test_linear_solutions_are_mapped_with_their_loads(solver, bend):
 def test_images_keep_norms_shape_and_type(solver):
     problem = solver.problem
     field = torch.rand(3, 2, *problem.shape, dtype=torch.float64, generator=torch.Generator())
-    for symmetry in symmetries(problem):
+    for symmetry in fem.symmetries(problem):
         image = symmetry.image(field)
         assert image.shape == field.shape
         assert_close(image.norm(dim=(-2, -1)), field.norm(dim=(-2, -1)), rtol=1e-14, atol=0)
@@ -373,8 +406,8 @@ def test_images_keep_norms_shape_and_type(solver):
 
 
 def test_the_order_is_always_the_same():
-    problem = Problem.build(ring(5), LinearElastic(0.3))
-    first, again = symmetries(problem), symmetries(problem)
+    problem = fem.Problem.build(ring(5), fem.LinearElastic(0.3))
+    first, again = fem.symmetries(problem), fem.symmetries(problem)
     for one, other in zip(first, again, strict=True):
         assert torch.equal(one.rotation, other.rotation)
         assert torch.equal(one.source, other.source)
@@ -385,5 +418,5 @@ def test_a_body_with_coincident_nodes_has_the_identity_only():
     shifted = CUBE.translated((1.0, 0.0, 0.0))
     cells = np.concatenate([CUBE.t, shifted.t + CUBE.nvertices], axis=1)
     mesh = skfem.MeshHex(np.concatenate([CUBE.p, shifted.p], axis=1), cells)
-    (one,) = symmetries(Problem.build(mesh, NH))
+    (one,) = fem.symmetries(fem.Problem.build(mesh, NH))
     assert one.source.tolist() == list(range(mesh.nvertices))

@@ -7,7 +7,6 @@ import torch
 
 import dpl.fem as fem
 from dpl import Sample, Scene
-from dpl.fem.symmetry import images
 from dpl.models import PODNet
 from dpl.training import MSE, Surrogate
 
@@ -99,7 +98,7 @@ def test_the_projection_of_loads_keeps_all_training_loads(scene, batch):
 def test_bases_with_images_of_the_samples_represent_images(scene, batch):
     """The group is that of `data.symmetry=true`."""
     group = fem.symmetries(scene.problem)
-    turned = images(batch.displacement, group, torch.full((len(batch.force),), 5)).flatten(1)
+    turned = group.images(batch.displacement, torch.full((len(batch.force),), 5)).flatten(1)
     own, both = (
         prepared(scene, batch, group=members, rank=96).net.modes.double() for members in ((), group)
     )

@@ -8,17 +8,17 @@ from dpl import training
 from dpl.config import run_folder
 from dpl.data import DataModule
 from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle, solve
-from dpl.fem.parity import Parities, SignedOrbits
+from dpl.fem.parity import Parities
+from dpl.fem.rom.pod import scatter_fields
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
-from dpl.fem.symmetry import cell_images, symmetries
+from dpl.fem.symmetry import SymmetryGroup
 from dpl.inference import Simulator
 from dpl.models import ClosedFormFit, HasCorrection, Unrolled
-from dpl.models.invariant_basis import scatter_fields
-from dpl.models.irreps import representations_of
 from dpl.models.unrolled.correction import choose_newton
 from dpl.models.unrolled.features import cell_gradients, rotated_strain, rotation, unbalanced_stress
-from dpl.models.unrolled.regression import GroupAction, Rows, fit_map, weighted_error
+from dpl.models.unrolled.fit import modes_of_parity
+from dpl.models.unrolled.regression import MapParities, Rows, fit_map, weighted_error
 from dpl.scene import Sample, Scene
 from dpl.training import MSE, Surrogate
 from tests.laws import COMPILED, ISOTROPIC, LAWS
@@ -273,16 +273,6 @@ def test_cell_gradients_of_a_linear_field(beam):
     assert (cell_gradients(beam.problem, field[None]) - H).abs().max() < 1e-12
 
 
-def test_images_of_cells_have_images_of_centres(beam):
-    problem = beam.problem
-    group = symmetries(problem)
-    centres = problem.points[problem.cells].mean(dim=1)
-    middle = problem.points.mean(dim=0)
-    for symmetry, image in zip(group, cell_images(problem, group), strict=True):
-        moved = (centres - middle) @ symmetry.rotation.T + middle
-        assert (centres[image] - moved).abs().max() < 1e-9
-
-
 def test_ridge_regression_finds_an_exact_map():
     random = torch.Generator().manual_seed(0)
     features = torch.randn(60, 2, 1, 3, 3, generator=random).double()
@@ -293,14 +283,9 @@ def test_ridge_regression_finds_an_exact_map():
 
 
 def no_symmetry():
-    """Return the action of the group of the identity on two cells and four coordinates."""
-    return GroupAction(
-        torch.eye(3)[None].double(),
-        torch.arange(2)[None],
-        torch.eye(4)[None].double(),
-        representations_of([]),
-        Parities.of([], 3),
-        torch.zeros(4, dtype=torch.int64),
+    """Return the parities of the identity at two cells and for four coordinates."""
+    return MapParities(
+        Parities.of(SymmetryGroup(), 3), torch.arange(2)[None], torch.zeros(4, dtype=torch.int64)
     )
 
 
@@ -327,27 +312,23 @@ def test_ridge_regression_is_that_of_the_normal_equations(count):
 
 
 def test_fields_of_definite_parity(beam, net):
-    group, free = symmetries(beam.problem), beam.problem.free
-    parities = Parities.of(group, 3)
+    group, parities = net.group, Parities.of(net.group, 3)
     assert len(parities.members) == 4
-    assert parities.characters.T @ parities.characters == pytest.approx(4 * torch.eye(4))
-    fields = scatter_fields(net.modes.double().T, free)
+    fields = scatter_fields(net.modes.double().T, beam.problem.free)
     for k, g in enumerate(parities.members.tolist()):
         factors = parities.characters[net.parity, k]
         assert torch.equal(group[g].image(fields), factors[:, None, None] * fields)
 
 
-def test_folding_is_the_transpose_of_unfolding(beam):
-    group, free = symmetries(beam.problem), beam.problem.free
-    parities, random = Parities.of(group, 3), torch.Generator().manual_seed(0)
-    orbits, count = SignedOrbits.of_field(parities, group, free), int(free.sum())
-    values = torch.randn(count, 2, generator=random).double()
-    total = torch.zeros(count, 2).double()
-    for characters in parities.characters:
-        folded = orbits.folded(values, characters)
-        own = orbits.unfolded(folded / orbits.weight[:, None], characters, count)
-        total += own / len(characters)
-    assert total == pytest.approx(values), "the parts of all parities add up to a field"
+def test_modes_are_the_best_of_all_images(beam, net):
+    free, random = beam.problem.free, torch.Generator().manual_seed(0)
+    snapshots = torch.randn(5, int(free.sum()), generator=random).double()
+    modes, _ = modes_of_parity(snapshots, net.group, free, 12)
+    assert modes.T @ modes == pytest.approx(torch.eye(12), abs=1e-6)
+    fields = scatter_fields(snapshots, free)
+    images = torch.cat([symmetry.image(fields)[:, free] for symmetry in net.group])
+    best = float(torch.linalg.svdvals(images).square()[:12].sum())
+    assert float((images @ modes).square().sum()) == pytest.approx(best, rel=1e-6)
 
 
 def test_the_fit_includes_newton_in_the_modes(beam, net):
@@ -382,11 +363,11 @@ def test_newton_estimates_errors_also_where_it_improves_nothing(beam, net):
 
 
 def test_the_held_out_error_is_the_mean_norm_of_the_errors_of_the_map(beam, monkeypatch):
-    """The error is summed over isotypic components, and agrees with that of the whole map."""
+    """The error is summed over parities, and agrees with that of the whole map."""
     seen = []
 
-    def watched(rows, held_out, action):
-        found = fit_map(rows, held_out, action)
+    def watched(rows, held_out, symmetry):
+        found = fit_map(rows, held_out, symmetry)
         error = held_out.targets - held_out.features.flatten(1) @ found.matrix
         seen.append((found.error, weighted_error(error, held_out.weights)))
         return found

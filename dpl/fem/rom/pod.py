@@ -56,6 +56,20 @@ def pod(snapshots: Tensor, rank: int) -> POD:
     return POD(vectors * largest.sgn().conj(), values)
 
 
+def scatter_fields(columns: Tensor, dofs: Tensor) -> Tensor:
+    """Return fields (S, N, D), zero outside a mask (N, D), from their n values in it, (S, n)."""
+    dofs = dofs.to(columns.device)
+    fields = columns.new_zeros(len(columns), *dofs.shape)
+    fields[:, dofs] = columns
+    return fields
+
+
+def orthonormal_fields(columns: Tensor, dofs: Tensor) -> Tensor:
+    """Return orthonormal fields (N, D, R), zero outside a mask (N, D), that span columns (n, R)."""
+    orthonormal = torch.linalg.qr(columns.double().cpu())[0]
+    return scatter_fields(orthonormal.T, dofs.cpu()).movedim(0, -1).contiguous()
+
+
 def _exact(snapshots: Tensor, rank: int) -> POD:
     """Return the modes (n, R), of any sign, and all singular values from a Gram matrix."""
     count, size = snapshots.shape

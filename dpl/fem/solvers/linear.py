@@ -16,7 +16,7 @@ from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotationalPreconditioner
 from dpl.fem.solvers.parity_factor import ParityFactor
 from dpl.fem.solvers.solution import Load, Solution, check_force, check_tol, evaluate_solution
-from dpl.fem.symmetry import Symmetry, symmetries
+from dpl.fem.symmetry import SymmetryGroup, symmetries
 
 MAX_CLONES = 4  # solvers of other parameters that are kept with their factors
 
@@ -82,7 +82,7 @@ class LinearSolver:
         return parent if parent and parent.problem.material is self.problem.material else None
 
     @cached_property
-    def symmetries(self) -> list[Symmetry]:
+    def symmetries(self) -> SymmetryGroup:
         """Symmetries of the body, which no parameters of the law change."""
         return self.parent.symmetries if self.parent else symmetries(self.problem)
 

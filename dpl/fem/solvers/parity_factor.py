@@ -5,7 +5,6 @@ symmetries the blocks have fewer entries than those of the whole matrix, and a s
 fewer.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Self
@@ -24,7 +23,7 @@ from dpl.fem.linear.condensation import (
 from dpl.fem.linear.interface import Array, DirectFactor, full_matrix
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
-from dpl.fem.symmetry import Symmetry
+from dpl.fem.symmetry import SymmetryGroup
 
 
 class OrbitForm(NamedTuple):
@@ -41,7 +40,7 @@ class OrbitForm(NamedTuple):
     points: NDArray[np.float64]
 
     @classmethod
-    def of(cls, problem: Problem, group: Sequence[Symmetry]) -> Self:
+    def of(cls, problem: Problem, group: SymmetryGroup) -> Self:
         """Return the orbits of a body under its symmetries; none: each value is an orbit."""
         parities = Parities.of(group, problem.shape[1])
         orbits = SignedOrbits.of_field(parities, group, problem.free)
@@ -50,9 +49,7 @@ class OrbitForm(NamedTuple):
 
     def parts(self, force: Tensor) -> Tensor:
         """Return the products of a force at free degrees of freedom, (n,), with fields, (M, m)."""
-        parities, orbits, _ = self
-        scales = orbits.sign * orbits.weight
-        return parities.characters @ (scales * force[orbits.images])
+        return self.orbits.by_parity(force, self.parities)
 
     def matrices(self, problem: Problem) -> list[csr_array]:
         """Return C^T K(0) C, (m, m), of the fields C of each parity; see `of`."""
@@ -77,7 +74,7 @@ class ParityFactor(DirectFactor):
     negative_pivots: int = 0
 
     @classmethod
-    def of(cls, problem: Problem, group: Sequence[Symmetry]) -> Self:
+    def of(cls, problem: Problem, group: SymmetryGroup) -> Self:
         """Factorise K(0) of a body.
 
         Raises:

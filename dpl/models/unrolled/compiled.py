@@ -1,6 +1,5 @@
 """Prediction of an unrolled reduced solver by one compiled call."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -16,7 +15,7 @@ from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedInverse
-from dpl.fem.symmetry import Symmetry
+from dpl.fem.symmetry import SymmetryGroup
 from dpl.models.unrolled.loops import (
     SOURCES,
     BasisArrays,
@@ -68,7 +67,7 @@ class CompiledPrediction:
     @classmethod
     def of(
         cls,
-        group: Sequence[Symmetry],
+        group: SymmetryGroup,
         free: Tensor,
         *,
         parity: Tensor,

@@ -1,6 +1,6 @@
 """Fit of `dpl.models.Unrolled` to samples: modes, sample cells and maps."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -9,25 +9,21 @@ from torch import Tensor
 from dpl.fem import Problem
 from dpl.fem.materials.material import Material
 from dpl.fem.parity import Parities, SignedOrbits
+from dpl.fem.rom.pod import MIN_SKETCH_SIZE, pod, scatter_fields
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness, reduced_terms
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
-from dpl.fem.symmetry import Symmetry, cell_images
-from dpl.models.invariant_basis import (
-    group_actions,
-    invariant_pod,
-    invariant_rank,
-    modes_of_parity,
-    scatter_fields,
-)
-from dpl.models.irreps import representations_of
+from dpl.fem.symmetry import Symmetry, SymmetryGroup
 from dpl.models.linear_response import LinearResponse
 from dpl.models.unrolled.features import SampleCells, cell_gradients
-from dpl.models.unrolled.regression import GroupAction, Rows, fit_map, weighted_error
+from dpl.models.unrolled.regression import MapParities, Rows, fit_map, weighted_error
 from dpl.scene import Sample
 
 CHUNK = 256  # samples whose fields or features are computed at a time
 SIZE_EXPONENT = -0.4  # errors count relative to the displacement to this power
+MAX_ROWS = 2**15  # samples and images to which maps are fitted
+MAX_BYTES = 2**31  # of snapshots and images from which modes are computed, in float32
 MIN_RANK = 40  # modes; fewer are not tried
+NOISE = 5e-7  # singular value over the largest below which a mode is rounding error
 LIMIT = 1.5  # factor on the largest ratio of corrections in the samples
 MIN_GAIN = 0.97  # largest ratio of held-out errors for which another map is worth its time
 
@@ -88,18 +84,6 @@ class Columns(NamedTuple):
     parameters: Tensor
 
 
-def cell_positions(images: Tensor, cells: Tensor) -> Tensor:
-    """Return the position to which each symmetry maps each of some cells, (G, C).
-
-    Args:
-        images: Image of each cell under each symmetry, (G, E).
-        cells: Numbers of cells of an invariant set, (C,).
-    """
-    place = torch.empty(images.shape[1], dtype=torch.int64)
-    place[cells] = torch.arange(len(cells))
-    return place[images[:, cells]]
-
-
 def sample_weights(displacement: Tensor) -> Tensor:
     """Return ||u||^-0.4, (S,), of displacements (S, n); 0 for u = 0."""
     size = displacement.norm(dim=1)
@@ -124,7 +108,55 @@ def in_coordinates(
         linear = stiffness.solve(factors, part.force[:, problem.free] @ modes)
         weights = sample_weights(part.displacement[:, problem.free])
         parts.append(Columns(linear, own @ modes, weights, part.parameters))
-    return Columns(*(torch.cat(column) for column in zip(*parts, strict=True)))
+    return _joined(parts)
+
+
+def _joined(parts: Iterable[Columns]) -> Columns:
+    """Return the samples of several sets as one set."""
+    return Columns(*map(torch.cat, zip(*parts, strict=True)))
+
+
+def _image(columns: Tensor, symmetry: Symmetry, free: Tensor) -> Tensor:
+    """Return the images (S, n) of fields (S, n) at free degrees of freedom."""
+    return symmetry.image(scatter_fields(columns, free))[:, free]
+
+
+def modes_of_parity(
+    snapshots: Tensor, group: SymmetryGroup, free: Tensor, rank: int
+) -> tuple[Tensor, Tensor]:
+    """Return POD modes (n, R) of snapshots (S, n) and their images, and their parities (R,).
+
+    Each mode has one parity. The largest mode is the first. They are rounded to float32.
+
+    Args:
+        snapshots: Fields at free degrees of freedom.
+        group: Symmetries of the body.
+        free: Mask of free degrees of freedom, (N, D).
+        rank: Largest number of modes.
+    """
+    parities = Parities.of(group, free.shape[1])
+    orbits = SignedOrbits.of_field(parities, group, free)
+    others = group.coset_representatives()
+    count, size = len(snapshots) * len(others), snapshots.shape[1]
+    some = snapshots[:: max(1, -(-4 * count * size // MAX_BYTES))]
+    dtype = torch.float32 if len(some) * len(others) > MIN_SKETCH_SIZE else torch.float64
+    modes, values, numbers = [], [], []
+    for p, characters in enumerate(parities.characters):
+        parts = [
+            orbits.coordinates(_image(part, symmetry, free), characters).to(dtype)
+            for symmetry in others
+            for part in some.split(CHUNK)
+        ]
+        rows = torch.cat(parts)
+        found = pod(rows, min(rank, *rows.shape))
+        most = found.vectors.shape[1]
+        modes.append(orbits.fields(found.vectors.T, characters, size))
+        values.append(found.values[:most])
+        numbers.append(torch.full((most,), p))
+    value = torch.cat(values)
+    order = value.argsort(descending=True, stable=True)[:rank]
+    order = order[value[order] >= NOISE * value.max()]
+    return torch.cat(modes)[order].T.contiguous().float().double(), torch.cat(numbers)[order]
 
 
 def _chunks(samples: Sample) -> Iterator[Sample]:
@@ -166,17 +198,22 @@ class Regression:
     """
 
     def __init__(
-        self, law: Material, cells: SampleCells, action: GroupAction, fitted: Columns, held: Columns
+        self,
+        law: Material,
+        cells: SampleCells,
+        symmetry: MapParities,
+        fitted: Columns,
+        held: Columns,
     ) -> None:
         """Start from the linear solution.
 
         Args:
             law: The law of the cells, perhaps with ranges.
             cells: The sample cells.
-            action: Symmetries of the cells and the coordinates.
+            symmetry: Parities of values at the cells and of coordinates.
             fitted, held: Samples to fit to, and to choose by.
         """
-        self._law, self._cells, self._action = law, cells, action
+        self._law, self._cells, self._symmetry = law, cells, symmetry
         self._sets = fitted, held
         self._present = [torch.zeros_like(part.linear) for part in self._sets]
         self._steps = [fitted.linear, held.linear]
@@ -207,7 +244,7 @@ class Regression:
     def add_map(self) -> bool:
         """Fit the next map; return False, without adding it, if it gains too little."""
         rows = [self._rows(*pair) for pair in zip(self._sets, self._present, strict=True)]
-        found = fit_map(rows[0], rows[1], self._action)
+        found = fit_map(rows[0], rows[1], self._symmetry)
         if not found.error < MIN_GAIN * self.errors[-1]:
             return False
         matrix = found.matrix.float().double()
@@ -240,8 +277,8 @@ class Regression:
 def fit_maps(
     problem: Problem,
     modes: Tensor,
-    group: Sequence[Symmetry],
-    symmetry: tuple[Tensor, Tensor],
+    parity: Tensor,
+    group: SymmetryGroup,
     samples: tuple[Columns, Columns],
     *,
     cells: int,
@@ -254,33 +291,27 @@ def fit_maps(
     Args:
         problem: The body.
         modes: V, (n, R).
+        parity: Parities of the modes, (R,).
         group: Symmetries of the body.
-        symmetry: Matrices of the symmetries in the modes, (G, R, R), and parities of these, (R,).
         samples: Samples to fit to, and to choose by.
         cells: Number of sample cells.
         stages: Largest number of maps after the first.
     """
-    images = cell_images(problem, group)
-    actions, parity = symmetry
-    representations = representations_of(group)
+    images = group.cell_images(problem)
     parities = Parities.of(group, problem.shape[1])
     fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])
     parity_of_fields = torch.cat([parity, torch.zeros(1, dtype=torch.int64)])
-    rotations = torch.stack([one.rotation for one in group] or [torch.eye(problem.shape[1])])
     best: tuple[Tensor, Regression] | None = None
     while cells:
         numbers = choose_cells(images, cells)
-        positions = cell_positions(images, numbers)
-        action = GroupAction(
-            rotations.double(), positions, actions, representations, parities, parity
-        )
+        positions = torch.searchsorted(numbers, images[:, numbers])
+        symmetry = MapParities(parities, positions[parities.members], parity)
         gradients = cell_gradients(problem, fields, numbers)
-        orbits = SignedOrbits.of_tensors(parities, positions[parities.members], 1, 1)
-        columns = orbits.symmetrised(gradients.flatten(1).T, parity_of_fields, parities)
+        columns = symmetry.orbits(1).symmetrised(gradients.flatten(1).T, parity_of_fields, parities)
         # rounded before the fit: the maps cancel digits, so that G must stay what it is
         sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
         law = problem.material.of_cells(numbers).centred()
-        regression = Regression(law, sample_cells, action, *samples)
+        regression = Regression(law, sample_cells, symmetry, *samples)
         while len(regression.ridges) <= stages and regression.add_map():
             pass
         if best is not None and regression.errors[-1] >= best[1].errors[-1]:
@@ -305,7 +336,7 @@ class FittedBuffers(NamedTuple):
 
 def fit_in_best_modes(
     problem: Problem,
-    group: Sequence[Symmetry],
+    group: SymmetryGroup,
     linear: LinearResponse,
     both: tuple[Sample, Sample],
     *,
@@ -329,24 +360,28 @@ def fit_in_best_modes(
     """
     rests = [nonlinear_displacement(problem, part, linear) for part in both]
     weights = sample_weights(both[0].displacement[:, problem.free])
-    basis = invariant_pod(weights[:, None] * rests[0], problem.free, group, rank)
-    every, parity = modes_of_parity(basis, problem.free, group)
-    actions = group_actions(every, problem.free, group)
+    every, parity = modes_of_parity(weights[:, None] * rests[0], group, problem.free, rank)
+    inverses = [symmetry.inverse for symmetry in group.coset_representatives()]
+    few = inverses[: max(1, MAX_ROWS // len(rests[0]))]
+    turned = [_image(every.T, one, problem.free).T for one in few]
     fits: list[tuple[float, FittedBuffers]] = []
     count = every.shape[1]
     while count:
-        modes, symmetry = every[:, :count], (actions[:, :count, :count], parity[:count])
+        modes = every[:, :count]
         stiffness = ReducedStiffness(reduced_terms(linear.terms, modes), linear.iteration)
-        fitted, held = (
-            in_coordinates(linear.terms, modes, stiffness, *pair)
-            for pair in zip(both, rests, strict=True)
+        # coordinates of images of the samples are those of the samples in images of the modes
+        fitted = _joined(
+            in_coordinates(linear.terms, images[:, :count], stiffness, both[0], rests[0])
+            for images in turned
         )
+        held = in_coordinates(linear.terms, modes, stiffness, both[1], rests[1])
         sets = fitted, held
-        numbers, found = fit_maps(problem, modes, group, symmetry, sets, cells=cells, stages=stages)
+        options = {"cells": cells, "stages": stages}
+        numbers, found = fit_maps(problem, modes, parity[:count], group, sets, **options)
         squares = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)  # not in V
         buffers = _buffers(modes, parity[:count], stiffness, numbers, found.maps)
         fits.append((found.error_with(squares), buffers))
-        count = invariant_rank(actions, count // 2) if count // 2 >= MIN_RANK else 0
+        count = count // 2 if count // 2 >= MIN_RANK else 0
     return min(fits, key=lambda pair: pair[0])[1], every
 
 

@@ -11,16 +11,16 @@ from dpl.fem import InvariantBasedMaterial, Material, SubspaceNewton, symmetries
 from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.parity import Parities
 from dpl.fem.rom.ecsw import Cubature, refuse_follower_loads
+from dpl.fem.rom.pod import orthonormal_fields
 from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
-from dpl.fem.symmetry import cell_images
-from dpl.models.invariant_basis import orthonormal_fields
+from dpl.fem.symmetry import SymmetryGroup
 from dpl.models.linear_base import SCALE_STREAM
 from dpl.models.linear_response import Array, LinearResponse
 from dpl.models.stored_buffers import StoredBuffers, check_indices
 from dpl.models.unrolled.compiled import CompiledPrediction, LawArguments, law_arguments
 from dpl.models.unrolled.correction import LOADS, choose_newton, remaining_error
 from dpl.models.unrolled.features import SampleCells
-from dpl.models.unrolled.fit import Maps, cell_positions, fit_in_best_modes
+from dpl.models.unrolled.fit import Maps, fit_in_best_modes
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.threads import on_threads
@@ -55,9 +55,9 @@ class Unrolled(StoredBuffers):
     solution, but the maps only ever see fields in the modes.
 
     Number of modes and of cells, ridges and number of maps are chosen by the error of the held-out
-    samples. The modes and the cells are invariant under the symmetries of the body and the maps
-    commute with them. The answer has the symmetries, those with diagonal matrices exactly and
-    others up to the rounding of modes and maps.
+    samples. Each mode is even or odd under the reflections and half turns of the body
+    (`dpl.fem.parity`), and the maps commute with these, so that the answer has these symmetries
+    exactly. The fit uses the images of the samples under the others. The answer has them nearly.
 
     K(0)^-1 f is computed for every load by products with dense blocks, see `LinearResponse`.
 
@@ -133,7 +133,8 @@ class Unrolled(StoredBuffers):
         refuse_follower_loads(scene.problem, "model=unrolled")
         constant = scene.loads.constant_force
         also = [] if constant is None else [constant]
-        self.group = symmetries(scene.problem, also=also) if symmetry else []
+        problem = scene.problem
+        self.group = symmetries(problem, also=also) if symmetry else SymmetryGroup.identity(problem)
         self.extra_inputs = ("parameters",) if scene.loads.parameter_ranges else ()
         self.linear = LinearResponse(scene, self.group)
         for name, (shape, dtype) in self._layout().items():
@@ -240,12 +241,12 @@ class Unrolled(StoredBuffers):
         """Compiled prediction with the present buffers."""
         if self._compiled is None or self._compiled[0] is not self.maps:
             problem = self.scene.problem
-            positions = cell_positions(cell_images(problem, self.group), self.cells)
+            images = self.group.cell_images(problem)[:, self.cells]
             names = ("parity", "modes", "gradients", "first_map", "maps", "limits")
             prediction = CompiledPrediction.of(
                 self.group,
                 problem.free,
-                positions=positions,
+                positions=torch.searchsorted(self.cells, images),
                 **{name: getattr(self, name) for name in names},
             )
             self._compiled = self.maps, prediction
@@ -352,7 +353,7 @@ class Unrolled(StoredBuffers):
 
     def skipped_work(self) -> list[str]:
         """Return the work that the model saves, one line each."""
-        members = max(1, len(self.group))
+        members = len(self.group)
         lines = [
             "no gradient descent: the maps are found by linear regression",
             "no modes for linear solutions: K(0) is condensed into dense blocks",
@@ -380,9 +381,9 @@ class Unrolled(StoredBuffers):
         check_indices(count, cells=cells, newton_cells=self.newton_cells)
         parities = Parities.of(self.group, problem.shape[1])
         check_indices(len(parities.members), parity=self.parity)
-        images = cell_images(problem, self.group)[:, cells.cpu()]
-        if len(cells.unique()) < len(cells) or not torch.isin(images, cells.cpu()).all():
-            raise ValueError("cells must be different cells, with all images under the symmetries")
+        images = self.group.cell_images(problem)[:, cells.cpu()]
+        if (cells.diff() <= 0).any() or not torch.isin(images, cells.cpu()).all():
+            raise ValueError("cells must ascend and have all images under the symmetries")
         for name in ("limits", "newton_weights", "outside_error"):
             if (getattr(self, name) < 0).any():
                 raise ValueError(f"{name} must be 0 or more")
