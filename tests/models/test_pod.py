@@ -7,6 +7,7 @@ import torch
 
 import dpl.fem as fem
 from dpl import Sample, Scene
+from dpl.fem.symmetry import NO_SYMMETRIES
 from dpl.models import PODNet
 from dpl.training import MSE, Surrogate
 
@@ -14,7 +15,7 @@ SMALL = {"width": 16, "blocks": 1}
 WHOLE = {"rank": 1000, "coordinates": 1000, **SMALL}  # no mode is left out
 
 
-def prepared(scene, samples, *, seed=0, base=None, group=(), **options):
+def prepared(scene, samples, *, seed=0, base=None, group=NO_SYMMETRIES, **options):
     """Return a surrogate in evaluation mode with random weights and fitted bases."""
     torch.manual_seed(seed)
     network = partial(PODNet, **{**SMALL, **options})
