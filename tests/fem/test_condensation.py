@@ -10,7 +10,7 @@ from dpl.fem.linear.condensation import (
     Condensed,
     condense,
     condensed_block_solve,
-    condensed_solve,
+    condensed_solves,
     front_blocks,
 )
 from dpl.fem.linear.dissection import LEAF, nested_dissection
@@ -95,13 +95,14 @@ def test_all_solutions_equal_those_of_a_dense_factorisation(graph):
     many = random.copy()
     condensed_block_solve(blocks.fronts, blocks.values[0], many)
     assert norm(many - exact) < 1e-11 * norm(exact)
+    table, unknowns, _ = blocks.fronts
     for dtype, most in ((np.float64, 1e-11), (np.float32, 1e-5)):
         values = blocks.values.astype(dtype)
-        for right, expected in zip(random.T, exact.T, strict=True):
-            solution = np.full(size, np.nan)
-            table, unknowns, _ = blocks.fronts
-            condensed_solve(table, unknowns, values[1], right.copy(), solution)
-            assert norm(2 * solution - expected) < most * norm(expected)
+        for right, expected in zip([*random.T, np.zeros(size)], [*exact.T, 0.0], strict=True):
+            solutions = np.full((2, size), np.nan)
+            condensed_solves(table, unknowns, values, np.stack([right, right]), solutions)
+            for k, solution in enumerate(solutions):
+                assert norm((1 + k) * solution - expected) <= most * norm(expected)
 
 
 def test_the_tensor_operations_equal_the_loops(graph):

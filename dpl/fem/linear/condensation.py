@@ -223,7 +223,10 @@ def condensed_solves(table, unknowns, values, forces, solutions):  # type: ignor
         solutions: (P, n), float64.
     """
     for p in range(len(values)):
-        condensed_solve(table, unknowns, values[p], forces[p], solutions[p])
+        if (forces[p] != 0.0).any():
+            condensed_solve(table, unknowns, values[p], forces[p], solutions[p])
+        else:
+            solutions[p] = 0.0
 
 
 def condensed_block_solve(fronts: Fronts, values: NDArray[Any], x: NDArray[Any]) -> None:
