@@ -160,7 +160,7 @@ class _Buffer:
         """Total number of uses left."""
         return int(self._uses_left.sum())
 
-    def put(self, new: Sequence[Sample]) -> None:
+    def put(self, new: list[Sample]) -> None:
         """Replace the oldest samples by new ones."""
         columns = stack(new)
         if not self._count:  # the system provides memory when it is first written

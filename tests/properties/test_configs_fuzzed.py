@@ -348,7 +348,17 @@ def _names() -> list[str]:
 NAMES = _names()
 
 KINDS = {
-    *("Mesh", "Material", "Newton", "LoadFamily", "DataSet", "DataModule", "Module", "Optimizer"),
+    *(
+        "Mesh",
+        "Material",
+        "Newton",
+        "LoadFamily",
+        "DataSet",
+        "DataModule",
+        "Module",
+        "Optimizer",
+        "Source",
+    ),
     *("LRScheduler", "Plane", "Box", "Sphere", "Cylinder", "Tag", "DirichletBC", "RobinBC"),
     *("Traction", "BodyForce", "FollowerPressure", "ActiveStress", "Loss"),
     *("CellField", "FibreEnergy", "FibreDirections", "ReferenceSolver"),
