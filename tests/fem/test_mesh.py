@@ -297,34 +297,22 @@ def test_aspect_ratio_of_a_tetrahedron_ignores_order_place_and_size():
         assert aspect_ratio(skfem.MeshTet(moved.T.copy(), cell)) == pytest.approx(100, rel=1e-9)
 
 
-@pytest.mark.parametrize("suffix", [".msh", ".vtu", ".vtk"])
-def test_hexahedra_of_a_file_are_those_that_were_written(tmp_path, suffix):
-    mesh = read_mesh(write(tmp_path / f"bar{suffix}", TWO_CUBES, hexahedron=TWO_HEXES))
-    assert isinstance(mesh, skfem.MeshHex)
-    assert np.array_equal(mesh.p.T, TWO_CUBES)
-    assert volumes(mesh) == pytest.approx(1.0, rel=1e-14)
+WRITTEN = {  # type, nodes, cells and their volumes in ascending order
+    "hexahedron": (skfem.MeshHex, TWO_CUBES, TWO_HEXES, [1.0, 1.0]),
+    "tetra": (skfem.MeshTet, CORNERS, TETS, [1 / 6] * 4 + [1 / 3]),
+    "triangle": (skfem.MeshTri, PATCH, FAN, [0.25] * 4),
+    "quad": (skfem.MeshQuad, PATCH[:4], np.array([[0, 1, 2, 3]]), [1.0]),
+}
 
 
 @pytest.mark.parametrize("suffix", [".msh", ".vtu", ".vtk"])
-def test_tetrahedra_of_a_file_are_those_that_were_written(tmp_path, suffix):
-    mesh = read_mesh(write(tmp_path / f"cube{suffix}", CORNERS, tetra=TETS))
-    assert isinstance(mesh, skfem.MeshTet)
-    assert np.array_equal(mesh.p.T, CORNERS)
-    assert np.sort(volumes(mesh)) == pytest.approx([1 / 6] * 4 + [1 / 3], rel=1e-14)
-
-
-@pytest.mark.parametrize("suffix", [".msh", ".vtu", ".vtk"])
-def test_planar_triangles_become_a_2d_mesh(tmp_path, suffix):
-    mesh = read_mesh(write(tmp_path / f"patch{suffix}", PATCH, triangle=FAN))
-    assert isinstance(mesh, skfem.MeshTri)
-    assert np.array_equal(mesh.p.T, PATCH[:, :2])
-    assert volumes(mesh) == pytest.approx(0.25, rel=1e-14)
-
-
-def test_planar_quads_become_a_2d_mesh(tmp_path):
-    mesh = read_mesh(write(tmp_path / "square.vtu", PATCH[:4], quad=np.array([[0, 1, 2, 3]])))
-    assert isinstance(mesh, skfem.MeshQuad)
-    assert volumes(mesh) == pytest.approx(1.0, rel=1e-14)
+@pytest.mark.parametrize("cell", WRITTEN)
+def test_cells_of_a_file_are_those_that_were_written_planar_ones_in_2d(tmp_path, cell, suffix):
+    kind, points, cells, sizes = WRITTEN[cell]
+    mesh = read_mesh(write(tmp_path / f"body{suffix}", points, **{cell: cells}))
+    assert isinstance(mesh, kind)
+    assert np.array_equal(mesh.p.T, points[:, : mesh.dim()])
+    assert np.sort(volumes(mesh)) == pytest.approx(sizes, rel=1e-14)
 
 
 @pytest.mark.parametrize("suffix", [".msh", ".vtu", ".vtk"])
@@ -477,20 +465,11 @@ def test_missing_file_is_an_error(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["junk.vtu", "junk.msh", "junk.vtk", "junk.inp", "junk.what"])
-@pytest.mark.parametrize("text", ["", "no mesh at all\n"])
-def test_unreadable_file_is_an_error_that_names_it(tmp_path, name, text):
+def test_unreadable_file_is_an_error_that_names_it(tmp_path, name):
     """On some of these files meshio calls sys.exit."""
-    (tmp_path / name).write_text(text)
+    (tmp_path / name).write_text("no mesh at all\n")
     with pytest.raises(ValueError, match=name):
         read_mesh(tmp_path / name)
-
-
-def test_half_a_file_is_an_error(tmp_path):
-    path = write(tmp_path / "bar.vtu", TWO_CUBES, hexahedron=TWO_HEXES)
-    text = path.read_bytes()
-    path.write_bytes(text[: len(text) // 2])
-    with pytest.raises(ValueError, match="cannot be read"):
-        read_mesh(path)
 
 
 @pytest.mark.parametrize("flaw", BROKEN_MESHES)
@@ -639,7 +618,7 @@ def test_a_file_that_ends_too_early_is_an_error_and_meshio_keeps_silent(tmp_path
     meshio.write(path, meshio.Mesh(mesh.p.T, [("tetra", mesh.t.T)]), file_format=kind, **binary)
     capfd.readouterr()
     text = path.read_bytes()
-    for part in np.linspace(0.0, 0.97, 10):
+    for part in np.linspace(0.0, 0.97, 6):
         path.write_bytes(text[: int(part * len(text))])
         with pytest.raises(ValueError, match=r"whole\.") as error:
             read_mesh(path)
