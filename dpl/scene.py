@@ -243,8 +243,8 @@ class Scene:
         fixed = int((~problem.free).any(dim=1).sum())
         moved = "moved" if problem.moved_supports else "fixed"
         springs = "" if problem.springs is None else ", an elastic foundation"
-        for term in problem.follower_loads.terms:
-            springs += f", {term.describe()}"
+        for part in problem.follower_loads.parts:
+            springs += f", {part.describe()}"
         for name, (low, high) in problem.follower_loads.ranges.items():
             springs += f", {name} from {low:.4g} to {high:.4g} Pa"
         force, displacement = self._largest_of_a_few()

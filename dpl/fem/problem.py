@@ -1,7 +1,7 @@
 """Static equilibrium of a body: built from a mesh, evaluated and linearised by compiled loops."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -47,14 +47,14 @@ class System(NamedTuple):
         force: (B, N, D) [-].
         tangent: Entries of K on the pattern, (B, nnz) [-].
         valid: Whether the strains that it was made at are those of some deformation, (B,).
-        asymmetry: Function x -> (K - K^T) x / 2 at free degrees of freedom, (n,) to (n,), if a
-            follower load has no potential; `tangent` is then the symmetric part. Else None.
+        skew: Entries of (K - K^T) / 2 on the pattern, (B, nnz) [-], if a follower load has no
+            potential; `tangent` is then the symmetric part. None if K is symmetric.
     """
 
     force: Tensor
     tangent: Tensor
     valid: Tensor
-    asymmetry: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    skew: Tensor | None = None
 
 
 class Problem(BodyVariants):
@@ -234,18 +234,10 @@ class Problem(BodyVariants):
         values = np.zeros(len(self.pattern.indices) + 1)
         lowest = kernels.system(displacement[0].contiguous().numpy(), gap, force, values)
         internal = self._with_boundary_forces(torch.from_numpy(force)[None], displacement)
-        tangent = self._with_boundary_entries(torch.from_numpy(values[:-1])[None], displacement)
+        entries = torch.from_numpy(values[:-1])[None]
+        tangent, skew = self._with_boundary_entries(entries, displacement)
         valid = torch.tensor([lowest > MIN_MIXED_VOLUME])
-        return System(internal, tangent, valid, self._asymmetry(displacement))
-
-    def _asymmetry(
-        self, displacement: Tensor
-    ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-        """Return `System.asymmetry` at (1, N, D)."""
-        if self.has_potential:
-            return None
-        product = self.follower_loads.asymmetry(displacement)
-        return lambda x: self.restrict(product(self.extend(x)[None])[0])
+        return System(internal, tangent, valid, skew)
 
     def stiffness_at_rest(self) -> Tensor:
         """Return the entries of K(0), (nnz,) [-], without follower loads.
@@ -270,7 +262,8 @@ class Problem(BodyVariants):
                 mean = self.volumes.at_points(self.volumes.coefficients(change) - gap.volume)
                 lowest = torch.minimum(lowest, mean.flatten(1).amin(1))
             valid = 1 + lowest > MIN_MIXED_VOLUME
-        return System(force, tangent, valid, self._asymmetry(displacement))
+        _, skew = self._with_boundary_entries(torch.zeros_like(tangent), displacement)
+        return System(force, tangent, valid, skew)
 
     def update_strain_gap(
         self, gap: Any, length: float, update: Tensor, displacement: Tensor | None = None

@@ -112,7 +112,7 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetr
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
     """Return the operators that commute with a symmetry: constraints, cells and loads."""
-    loads = [term.generic.force for term in problem.follower_loads.terms]
+    loads = [problem.follower_loads.generic.force] if problem.follower_loads else []
     springs = [] if problem.springs is None else [problem.springs.force]
     body = problem.generic.without_follower_loads
     cells = body if problem.springs is None else replace(body, springs=None)

@@ -99,7 +99,7 @@ def test_tangent_is_the_derivative_of_the_force_and_symmetric(active):
     matrix = full_matrix(problem.pattern, (system.tangent - elastic.tangent)[0].numpy())
     found, expected = matrix @ problem.restrict(v[0]), problem.restrict(slope[0])
     assert np.abs(found - expected).max() < 1e-7 * np.abs(expected).max()
-    assert system.asymmetry is None
+    assert system.skew is None
     assert_close(problem.tangent(u), system.tangent, rtol=1e-10, atol=1e-12)
 
 

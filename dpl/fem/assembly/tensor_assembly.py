@@ -14,7 +14,7 @@ from torch import Tensor
 from dpl.fem.assembly import mean_dilatation
 from dpl.fem.assembly.boundary_conditions import FoundationMatrix
 from dpl.fem.assembly.elements import basis_of
-from dpl.fem.assembly.follower_loads import NO_LOADS, FollowerLoads, Places
+from dpl.fem.assembly.follower_loads import NO_LOADS, FollowerLoads, LoadedPart, Places
 from dpl.fem.assembly.mean_dilatation import CellVolumes
 from dpl.fem.assembly.recovery import Recovery
 from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_modes
@@ -156,8 +156,7 @@ class TensorAssembly:
     def energy(self, displacement: Tensor) -> Tensor:
         """Return the energy over E L^D, (B,) [-]: strain energy, foundation and follower loads.
 
-        The energy of a follower load is its potential only if it has one, see
-        `FollowerTerm.has_potential`.
+        The energy of a follower load is its potential only if it has one, see `has_potential`.
         """
         H = self.gradient(displacement)
         if self.volumes is None:
@@ -190,7 +189,7 @@ class TensorAssembly:
             entries = self._assembled(self.material.tangent(H))
         else:
             entries = self._assembled(*mean_dilatation.tangent(self.material, H, self.volumes))
-        return self._with_boundary_entries(entries, displacement)
+        return self._with_boundary_entries(entries, displacement)[0]
 
     def strain(self, displacement: Tensor) -> Tensor:
         """Return the Green-Lagrange strain at the quadrature points, (B, E, Q, 3, 3) [-]."""
@@ -221,7 +220,7 @@ class TensorAssembly:
         else:
             stress, parts = mean_dilatation.mixed_system(self.material, H, gap, self.volumes)
         force = self._with_boundary_forces(self._nodal_forces(stress), displacement)
-        return force, self._with_boundary_entries(self._assembled(*parts), displacement)
+        return force, self._with_boundary_entries(self._assembled(*parts), displacement)[0]
 
     def tangent_product(self, displacement: Tensor, direction: Tensor) -> Tensor:
         """Return K(u) v on all degrees of freedom without assembling K, (B, N, D) [-]."""
@@ -246,9 +245,8 @@ class TensorAssembly:
         It is minus the nodal forces of dead loads; zero without follower loads. (B, N, D) if each
         member of a batch has its own stresses.
         """
-        count = self.follower_loads.n_members
-        forces = self.follower_loads.force(self.points.new_zeros(count, *self.shape))
-        return forces[0] if count == 1 else forces
+        forces = self.follower_loads.force(self.points.new_zeros(1, *self.shape))
+        return forces[0] if len(forces) == 1 else forces
 
     @cached_property
     def pattern(self) -> Pattern:
@@ -309,23 +307,33 @@ class TensorAssembly:
             internal = internal + self.follower_loads.force(displacement)
         return internal
 
-    def _with_boundary_entries(self, tangent: Tensor, displacement: Tensor) -> Tensor:
-        """Return entries of the tangent (B, nnz) plus those of foundation and follower loads."""
+    def _with_boundary_entries(
+        self, tangent: Tensor, displacement: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return entries (B, nnz) with foundation and follower loads, and the skew part."""
         if self.springs is not None:
             rows, columns, stiffness = (part.cpu().numpy() for part in self.springs)
             places = self.pattern.between(rows, columns)
             added = np.bincount(places.ravel(), stiffness.ravel(), len(self.pattern.indices) + 1)
             tangent = tangent + torch.from_numpy(added[:-1]).to(tangent.device)
-        if self.follower_loads:
-            tangent = self.follower_loads.add_stiffness(
-                tangent, displacement, self._follower_places
-            )
-        return tangent
+        if not self.follower_loads:
+            return tangent, None
+        added, skew = self._follower_stiffness(self.follower_loads, displacement)
+        return tangent + added, skew
+
+    def _follower_stiffness(
+        self, loads: FollowerLoads, displacement: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return `FollowerLoads.stiffness`."""
+        for part in loads.parts:
+            if part not in self._follower_places:
+                self._follower_places[part] = part.places(self.pattern)
+        return loads.stiffness(displacement, self.pattern, self._follower_places)
 
     @cached_property
-    def _follower_places(self) -> Places:
+    def _follower_places(self) -> dict[LoadedPart, Places]:
         """Places of the stiffness of the follower loads on the pattern."""
-        return self.follower_loads.places(self.pattern, self.points.device)
+        return {}
 
     def _assembled(
         self, moduli: Tensor, slope: Tensor | None = None, stiffness: Tensor | None = None

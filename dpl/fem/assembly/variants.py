@@ -55,9 +55,7 @@ class BodyVariants(EquilibriumCriterion):
         if not self.follower_loads.ranges or self.young is None:
             return body
         stresses = parameters[:, count:] / self.young
-        twin = body._with_follower_loads(self.follower_loads.with_values(stresses))
-        twin.__dict__["has_potential"] = self.has_potential
-        return twin
+        return body._with_follower_loads(self.follower_loads.with_values(stresses))
 
     @property
     def parameter_ranges(self) -> dict[str, ParameterRange]:
@@ -77,18 +75,15 @@ class BodyVariants(EquilibriumCriterion):
         Args:
             parameters: Values of `parameter_ranges`, (B, P).
         """
-        own = parameters[:, len(self.material.parameter_ranges) :]
-        return torch.einsum("bp,pnd->bnd", own, self._unit_forces_at_rest.to(own))
+        stresses = parameters[:, len(self.material.parameter_ranges) :]
+        if self.young is not None:
+            stresses = stresses / self.young
+        return torch.einsum("bp,pnd->bnd", stresses, self._unit_forces_at_rest.to(stresses))
 
     @cached_property
     def _unit_forces_at_rest(self) -> Tensor:
-        """f_int at u = 0 of each follower load with a range at 1 Pa alone, (P, N, D) [1/Pa]."""
-        rest = self.points.new_zeros(len(self.follower_loads.ranges), *self.shape)
-        if not len(rest) or self.young is None:
-            return rest
-        units = torch.eye(len(rest)).to(rest) / self.young
-        constant = self.without_ranged_loads.force_at_rest
-        return self.follower_loads.with_values(units).force(rest) - constant
+        """f_int at u = 0 of each follower load with a range at a stress of E, (P, N, D) [-]."""
+        return self.follower_loads.unit_forces(self.points.new_zeros(1, *self.shape))
 
     def with_material(self, material: Material) -> Self:
         """Return the body of another law; mesh and pattern are shared, for the same law kernels."""
@@ -128,10 +123,7 @@ class BodyVariants(EquilibriumCriterion):
         """Return the body under `factor` times its follower loads; all else is shared."""
         if not self.follower_loads or factor == 1:
             return self
-        twin = self._with_follower_loads(self.follower_loads.scaled(factor))
-        twin.__dict__["has_potential"] = self.has_potential
-        twin.__dict__["force_at_rest"] = factor * self.force_at_rest
-        return twin
+        return self._with_follower_loads(self.follower_loads.scaled(factor))
 
     def _with_follower_loads(self, loads: FollowerLoads) -> Self:
         """Return the body with other stresses on the same facets and cells; all else is shared."""
@@ -185,5 +177,12 @@ class BodyVariants(EquilibriumCriterion):
 
     @cached_property
     def has_potential(self) -> bool:
-        """True if the follower loads have a potential; also without one."""
-        return self.follower_loads.has_potential(self.free, self.prescribed)
+        """True if the tangent is symmetric under the follower loads, whatever their values.
+
+        The stiffness of a follower load is at most linear in u, so that one random displacement
+        decides.
+        """
+        random = torch.Generator().manual_seed(0)
+        noise = torch.rand(1, *self.shape, generator=random, dtype=torch.float64) - 0.5
+        u = torch.where(self.free, 0.1 * noise.to(self.free.device), 0.7 * self.prescribed)
+        return self._follower_stiffness(self.follower_loads.generic, u)[1] is None

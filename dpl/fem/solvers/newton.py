@@ -195,20 +195,18 @@ class Newton:
         It contains the step of the supports.
         """
         problem, u = self.problem.with_follower_factor(factor), state.displacement
-        internal, tangent, asymmetry = self._internal(state, factor), None, None
+        internal, tangent, skew = self._internal(state, factor), None, None
         if u.any():
             system = problem.linearise(u, state.gap)
             system = system if system.valid else problem.linearise(u)
             internal, tangent = system.force, system.tangent[0].numpy()
-            asymmetry = system.asymmetry
+            skew = None if system.skew is None else system.skew[0].numpy()
         right = factor * force - internal
         if state.support_step.any():
             right = right - problem.tangent_product(u, state.support_step)
         values = problem.restrict(right[0])
         definite = self.abandon_indefinite_guess and run.from_guess
-        step = run.tangents.solve(
-            tangent, u, values, rtol, near=near, definite=definite, asymmetry=asymmetry
-        )
+        step = run.tangents.solve(tangent, u, values, rtol, near=near, definite=definite, skew=skew)
         return problem.extend(step)[None] + state.support_step
 
     def _update(self, state: "_State", update: Tensor, *, halvings: int) -> "_State | None":
