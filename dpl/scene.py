@@ -293,7 +293,7 @@ class Scene:
             lines.append(f"one K(0) for all values of {names}: it is that without follower loads")
         if problem.springs is None:
             lines.append("no springs, nothing of theirs assembled")
-        if problem.equal_cells:
+        if problem.discretisation.equal_cells:
             lines.append(f"one set of shape gradients for {cells} equal cells")
         if points == 1:
             lines.append(f"one quadrature point for each of {cells} cells: gradients are constant")

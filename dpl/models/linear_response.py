@@ -1,5 +1,6 @@
 """The linear solution K(0)^-1 f of every load, by nested static condensation."""
 
+from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -63,7 +64,8 @@ class LinearResponse:
     @cached_property
     def terms(self) -> StiffnessTerms:
         """Terms of K(0) of the body."""
-        return StiffnessTerms.of(self._scene.problem.without_ranged_loads)
+        problem = self._scene.problem
+        return StiffnessTerms.of(replace(problem, follower_loads=problem.follower_loads.constant))
 
     @property
     def is_iterated(self) -> bool:
@@ -94,7 +96,7 @@ class LinearResponse:
         nodes = (self.iteration.node,) if self.is_iterated else self.interpolation.nodes
         if self.is_iterated or len(nodes) > 1:
             laws = [self.terms.body(torch.tensor(one).double()).material for one in nodes]
-            bodies = [bodies[0].with_material(law) for law in laws]
+            bodies = [replace(bodies[0], material=law) for law in laws]
         matrices = [matrix for one in bodies for matrix in self._form.matrices(one)]
         exact = condense(matrices, self._form.points)
         rounded = exact._replace(values=exact.values.astype(np.float32))

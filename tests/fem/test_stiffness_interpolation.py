@@ -135,7 +135,13 @@ def test_stiffness_is_the_sum_of_its_terms(grid, name):
     problem = Problem.build(grid("hexahedron"), laws, regions=region, fixed=Plane(0, "min"))
     terms = StiffnessTerms.of(problem)
     assert len(terms) == count
-    body = problem.generic
+    values = [
+        ends.at(t)
+        for ends, t in zip(
+            problem.parameter_ranges.values(), (0.3, 0.8, 0.1, 0.6, 0.45), strict=False
+        )
+    ]
+    body = problem.with_parameters(torch.tensor([values]).double())
     parts = [one.stiffness_at_rest() for one in terms.bodies]
     found = (terms.factors(body.material)[0, :, None] * torch.stack(parts)).sum(dim=0)
     expected = body.stiffness_at_rest()

@@ -8,10 +8,11 @@ import numpy as np
 import skfem
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.assembly.elements import gradients
-from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Places, Stress
+from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Stress, entry_map
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.fibre_reinforced import FibreDirections, fibre_frames
 from dpl.fem.materials.material import Material
@@ -47,7 +48,6 @@ class ActiveStress(FollowerLoad):
     name: str | None = None
 
     def check(self, mesh: skfem.Mesh, units: Units) -> None:
-        """See `FollowerLoad.check`."""
         self.dimensionless(units)
         self._cells(mesh, units.length)
 
@@ -121,11 +121,9 @@ class ActiveFibres(LoadedPart):
 
     @property
     def directions(self) -> Tensor:
-        """See `LoadedPart.directions`."""
         return self.fibre
 
     def describe(self) -> str:
-        """See `LoadedPart.describe`."""
         return f"active stress in {len(self.cells):,} cells"
 
     def force(self, displacement: Tensor) -> Tensor:
@@ -140,9 +138,9 @@ class ActiveFibres(LoadedPart):
         strain = ((self.fibre + change / 2) * change).sum(-1)
         return (strain * self.volumes).sum((-2, -1))
 
-    def stiffness(self, displacement: Tensor) -> tuple[Tensor, None]:
+    def stiffness(self, displacement: Tensor) -> list[Tensor]:
         """Return entries of d force / du for pairs of nodes a <= b, b slowest, (B, M) [-]."""
-        return self._stiffness.expand(len(displacement), -1), None
+        return [self._stiffness.expand(len(displacement), -1)]
 
     @cached_property
     def _stiffness(self) -> Tensor:
@@ -151,10 +149,9 @@ class ActiveFibres(LoadedPart):
         b, a = np.tril_indices(self.nodes.shape[1])
         return matrices[:, a, b].flatten()
 
-    def places(self, pattern: Pattern) -> Places:
-        """See `LoadedPart.places`."""
+    def maps(self, pattern: Pattern) -> list[csr_array]:
+        """Return the map of the entries, which are equal for all components."""
         own = pattern.places[self.cells.cpu().numpy()]  # (S, pairs, D, D)
-        target = own.diagonal(axis1=-2, axis2=-1).astype(np.int64)
-        source = np.arange(target[..., 0].size).repeat(target.shape[-1])
-        one = np.ones(target.size)
-        return Places.stored(pattern, self.nodes.device, source, target.flatten(), one, one)
+        target = own.diagonal(axis1=-2, axis2=-1).reshape(-1, own.shape[-1])
+        source = np.broadcast_to(np.arange(len(target))[:, None], target.shape)
+        return [entry_map(pattern, target, source, np.ones(target.shape))]

@@ -6,11 +6,13 @@ Their nodal forces depend on the displacement and are a part of the internal for
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from functools import cached_property
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import skfem
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.assembly.sparsity import Pattern
@@ -46,11 +48,7 @@ class FollowerLoad:
 
     @property
     def range(self) -> ParameterRange | None:
-        """Range of the stress [Pa]; None if it is one number.
-
-        Raises:
-            ValueError: `value` is neither a finite number nor a range.
-        """
+        """Range of the stress [Pa]; None if it is one number."""
         if is_range(self.value):
             try:
                 return ParameterRange.of("value", self.value)
@@ -66,12 +64,7 @@ class FollowerLoad:
         return None
 
     def dimensionless(self, units: Units) -> float:
-        """Return the stress over E [-]; NaN for a range, until a load says which.
-
-        Raises:
-            ValueError: `value` is neither a finite number nor a range, or the loads have a range
-                of moduli.
-        """
+        """Return the stress over E [-]; NaN for a range, until a load says which."""
         ends = self.range
         one = ends[0] if ends else self.value
         stress = float(units.stress(np.array(one, dtype=np.float64), f"value = {self.value}"))
@@ -95,33 +88,8 @@ class FollowerLoad:
             units: L and E.
             material: Law of the body, after `Material.on`.
             origin: Origin of the coordinates, (D,) [-].
-
-        Raises:
-            ValueError: The load does not fit the body.
         """
         raise NotImplementedError
-
-
-class Places(NamedTuple):
-    """Map from the entries of `LoadedPart.stiffness` to the stored values of K.
-
-    Attributes:
-        source: Number of each entry, (P,).
-        target: Its position among the nnz values, (P,).
-        sign: Its factor in the symmetric part, (P,) or scalar.
-        skew_sign: Its factor in the skew part, of which the upper triangle is stored.
-    """
-
-    source: Tensor
-    target: Tensor
-    sign: Tensor
-    skew_sign: Tensor
-
-    @classmethod
-    def stored(cls, pattern: Pattern, device: torch.device, *arrays: Any) -> Self:
-        """Return the places whose target is one of the nnz stored values."""
-        kept = arrays[1] < len(pattern.indices)
-        return cls(*(torch.from_numpy(array[kept]).to(device) for array in arrays))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,16 +128,27 @@ class LoadedPart:
         """
         raise NotImplementedError
 
-    def stiffness(self, displacement: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return entries of A = d force / du: symmetric and skew part, (B, M) [-] each.
+    def stiffness(self, displacement: Tensor) -> list[Tensor]:
+        """Return entries of A = d force / du, (B, M) [-]: those of the symmetric and the skew part.
 
-        The skew part is None if A is symmetric for any supports.
+        There is no skew part if A is symmetric for any supports.
         """
         raise NotImplementedError
 
-    def places(self, pattern: Pattern) -> Places:
-        """Return where entries of `stiffness` are stored in K."""
+    def maps(self, pattern: Pattern) -> list[csr_array]:
+        """Return the matrices (nnz, M) from entries of `stiffness` to entries of K."""
         raise NotImplementedError
+
+    def maps_on(self, pattern: Pattern) -> list[csr_array]:
+        """Return `maps`, computed once for the last pattern."""
+        if pattern not in self._maps:
+            self._maps.clear()
+            self._maps[pattern] = self.maps(pattern)
+        return self._maps[pattern]
+
+    @cached_property
+    def _maps(self) -> dict[Pattern, list[csr_array]]:
+        return {}
 
     def describe(self) -> str:
         """Return the part in words."""
@@ -207,11 +186,7 @@ class FollowerLoads:
         material: Material,
         origin: Origin,
     ) -> Self:
-        """Return loads on a body; arguments as in `FollowerLoad.on`.
-
-        Raises:
-            ValueError: A load does not fit the body, or two ranges have one name.
-        """
+        """Return loads on a body; arguments as in `FollowerLoad.on`."""
         ranges: dict[str, ParameterRange] = {}
         values, parts = [], []
         for load in loads:
@@ -277,6 +252,11 @@ class FollowerLoads:
         return type(self)(self.parts, every.index_copy(1, self._ranged.nonzero()[:, 0], values))
 
     @property
+    def constant(self) -> Self:
+        """The loads with 0 in place of each range."""
+        return type(self)(self.parts, self.values.nan_to_num())
+
+    @property
     def generic(self) -> Self:
         """The loads with a different stress in place of each range."""
         count = int(self._ranged.sum())
@@ -293,7 +273,7 @@ class FollowerLoads:
         return self._weighted(works, displacement.new_zeros(len(displacement)))
 
     def unit_forces(self, displacement: Tensor) -> Tensor:
-        """Return the forces, (R, N, D) [-], at (1, N, D) of the loads with a range at a stress of E."""
+        """Return `force` at (1, N, D) of each load with a range at a stress of E, (R, N, D) [-]."""
         pairs = zip(self.parts, self._ranged, strict=True)
         forces = [part.force(displacement) for part, ranged in pairs if ranged]
         return torch.cat(forces) if forces else displacement[:0]
@@ -304,31 +284,33 @@ class FollowerLoads:
             total = total + value.reshape(-1, *(1,) * (term.ndim - 1)) * term
         return total
 
-    def stiffness(
-        self, displacement: Tensor, pattern: Pattern, places: Mapping[LoadedPart, Places]
-    ) -> tuple[Tensor, Tensor | None]:
-        """Return the symmetric and the skew part of d force / du on a pattern, (B, nnz) [-] each.
+    def stiffness(self, displacement: Tensor, pattern: Pattern) -> tuple[Tensor, Tensor | None]:
+        """Return the symmetric and the skew part of d force / du on the pattern, (B, nnz) each.
 
         The skew part is None where it is zero to rounding: then the matrix is symmetric.
-
-        Args:
-            displacement: u, (B, N, D) [-].
-            pattern: Pattern of K.
-            places: `LoadedPart.places` of each part on it.
         """
-        symmetric = displacement.new_zeros(len(displacement), len(pattern.indices))
-        skew, largest = torch.zeros_like(symmetric), 0.0
-        for value, part in zip(self.values.unbind(1), self.parts, strict=True):
-            entries, skew_entries = part.stiffness(displacement)
-            source, target, sign, skew_sign = places[part]
-            scale = value[:, None]
-            symmetric = symmetric.index_add(1, target, scale * sign * entries[:, source])
-            if skew_entries is not None:
-                added = scale * skew_sign * skew_entries[:, source]
-                skew = skew.index_add(1, target, added)
-                largest = max(largest, float(added.abs().max()))
-        is_symmetric = float(skew.abs().max()) <= ASYMMETRIC * largest
-        return symmetric, None if is_symmetric else skew
+        symmetric, skew = np.zeros((2, len(displacement), len(pattern.indices)))
+        largest = 0.0
+        for value, part in zip(self.values.detach().cpu().numpy().T, self.parts, strict=True):
+            parts = zip(
+                (symmetric, skew), part.stiffness(displacement), part.maps_on(pattern), strict=False
+            )
+            for total, entries, matrix in parts:
+                scaled = value[:, None] * entries.detach().cpu().numpy()
+                total += (matrix @ scaled.T).T
+                largest = max(largest, np.abs(scaled).max())
+        found = [torch.from_numpy(part).to(displacement.device) for part in (symmetric, skew)]
+        is_symmetric = np.abs(skew).max(initial=0.0) <= ASYMMETRIC * largest
+        return found[0], None if is_symmetric else found[1]
+
+
+def entry_map(pattern: Pattern, target: Any, source: Any, factor: Any) -> csr_array:
+    """Return the matrix (nnz, M) that adds `factor` times entry `source` to K at `target`.
+
+    Arguments are arrays of one shape. Targets that K does not store are omitted.
+    """
+    stored, shape = target < len(pattern.indices), (len(pattern.indices), source.max() + 1)
+    return csr_array((factor[stored], (target[stored], source[stored])), shape=shape)
 
 
 NO_LOADS = FollowerLoads()

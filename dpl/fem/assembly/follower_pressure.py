@@ -8,10 +8,11 @@ import numpy as np
 import skfem
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.assembly.elements import QUADRATIC
-from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Places, Stress
+from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Stress, entry_map
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin, Region, facets_in
@@ -42,7 +43,6 @@ class FollowerPressure(FollowerLoad):
     name: str | None = None
 
     def check(self, mesh: skfem.Mesh, units: Units) -> None:
-        """See `FollowerLoad.check`."""
         self.dimensionless(units)
         facets_in(self.region, mesh)
 
@@ -53,11 +53,7 @@ class FollowerPressure(FollowerLoad):
         material: Material,
         origin: Origin = 0.0,
     ) -> "PressureSurface":
-        """Return the loaded surface, see `FollowerLoad.on`.
-
-        Raises:
-            ValueError: The region contains no boundary facet.
-        """
+        """Return the loaded surface, see `FollowerLoad.on`."""
         return PressureSurface.build(
             basis, facets_in(self.region, basis.mesh, units.length, origin)
         )
@@ -114,7 +110,6 @@ class PressureSurface(LoadedPart):
         )
 
     def describe(self) -> str:
-        """See `LoadedPart.describe`."""
         return f"follower pressure on {len(self.nodes):,} facets"
 
     def force(self, displacement: Tensor) -> Tensor:
@@ -134,19 +129,18 @@ class PressureSurface(LoadedPart):
         normal = cross(t1, t2) + (cross(t1, h2) + cross(h1, t2)) / 2 + cross(h1, h2) / 3
         return (self._sum_of_normals(normal, displacement) * displacement).sum((-2, -1))
 
-    def stiffness(self, displacement: Tensor) -> tuple[Tensor, Tensor]:
-        """Return symmetric and skew part of the load stiffness, (B, S A (A + 1)/2 3) each.
+    def stiffness(self, displacement: Tensor) -> list[Tensor]:
+        """Return entries of the load stiffness, (B, S A (A + 1)/2 3) [-] each.
 
         The block of the nodes a <= b (b slowest) is the cross product with one vector: its entries
         (i, k) are epsilon_ikl times the component l. In the symmetric part, blocks of a node with
         itself are zero. In the skew part the blocks of neighbouring facets cancel, so that only the
-        edge of the surface is left. `places` takes its blocks of a node with itself twice.
+        edge of the surface is left.
         """
         b, a = np.tril_indices(self.nodes.shape[1])
         vectors = self._pair_vectors(displacement)
         here, there = vectors[:, :, a, b] / 2, vectors[:, :, b, a] / 2
-        once = torch.from_numpy(np.where(a == b, 0.5, 1.0)).to(vectors)[:, None]
-        return (here - there).flatten(1), (once * (here + there)).flatten(1)
+        return [(here - there).flatten(1), (here + there).flatten(1)]
 
     def _pair_vectors(self, displacement: Tensor) -> Tensor:
         """Return vectors c of all pairs of nodes, (B, S, A, A, 3) [-].
@@ -165,21 +159,22 @@ class PressureSurface(LoadedPart):
         first, second = (weights * slopes[:, :, None]).flatten(2, 3)
         return first, second
 
-    def places(self, pattern: Pattern) -> Places:
-        """See `LoadedPart.places`."""
+    def maps(self, pattern: Pattern) -> list[csr_array]:
+        """Return the maps of both parts; K stores the upper triangle."""
         nodes = self.nodes.cpu().numpy()
         b, a = np.tril_indices(nodes.shape[1])
         missing = 3 - pattern.number.shape[1]
         numbers = np.pad(pattern.number, ((0, 0), (0, missing)), constant_values=-1)
         rows, columns = numbers[nodes[:, a]], numbers[nodes[:, b]]  # (S, pairs, 3)
         i, k = np.array([1, 2, 0]), np.array([2, 0, 1])  # epsilon_ikl = 1 for l = 0, 1, 2
-        first = np.stack([rows[..., i], rows[..., k]]).reshape(2, -1)
-        second = np.stack([columns[..., k], columns[..., i]]).reshape(2, -1)
-        sign = np.broadcast_to([[1.0], [-1.0]], first.shape)
-        source = np.broadcast_to(np.arange(first.shape[1]), first.shape)
+        first = np.stack([rows[..., i], rows[..., k]])
+        second = np.stack([columns[..., k], columns[..., i]])
+        source = np.broadcast_to(np.arange(first[0].size).reshape(first[0].shape), first.shape)
         target = pattern.positions(first, second)
-        skew_sign = np.where(first < second, sign, -sign)
-        return Places.stored(pattern, self.nodes.device, source, target, sign, skew_sign)
+        sign = np.array([1.0, -1.0])[:, None, None, None] * np.ones(first.shape)
+        # the two halves of the block of a node with itself fall on the same entries
+        skew_sign = np.where(first < second, sign, -sign) * np.where(a == b, 0.5, 1.0)[:, None]
+        return [entry_map(pattern, target, source, factor) for factor in (sign, skew_sign)]
 
     def _slopes(self, displacement: Tensor) -> Tensor:
         """Return du/dxi_i at the quadrature points, (B, S, Q, 3, 2) [-]; in 2D with zeros."""

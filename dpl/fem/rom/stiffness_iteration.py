@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
@@ -104,7 +104,7 @@ class TermMatrices(NamedTuple):
         matrices = [form.matrices(body) for body in terms.bodies]
         if terms.problem.springs is not None:
             law = terms.bodies[0].material
-            both = form.matrices(terms.problem.reference.with_material(law))
+            both = form.matrices(replace(terms.problem.reference, material=law))
             matrices.append([a - b for a, b in zip(both, matrices[0], strict=True)])
         else:
             matrices.append([0 * one for one in matrices[0]])
