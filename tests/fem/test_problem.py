@@ -600,6 +600,7 @@ def test_copy_on_a_device_and_copy_by_pickle_are_the_same_problem(bent):
         assert torch.equal(copy.internal_force(u), problem.internal_force(u))
         assert torch.equal(copy.relative_residual(u, force), problem.relative_residual(u, force))
         assert copy.length == problem.length
+        assert replace(copy, material=NH).pattern is copy.pattern
 
 
 def test_strain_of_no_deformation_is_not_valid(kind, law, grid):

@@ -7,7 +7,6 @@ from typing import ClassVar
 import numpy as np
 import skfem
 import torch
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
@@ -47,10 +46,6 @@ class ActiveStress(FollowerLoad):
     directions: FibreDirections | None = None
     name: str | None = None
 
-    def check(self, mesh: skfem.Mesh, units: Units) -> None:
-        self.dimensionless(units)
-        self._cells(mesh, units.length)
-
     def on(
         self,
         basis: skfem.Basis,
@@ -63,7 +58,9 @@ class ActiveStress(FollowerLoad):
         Raises:
             ValueError: The region contains no cell, or no fibre directions are known in one.
         """
-        cells = self._cells(basis.mesh, units.length, origin)
+        cells = np.arange(basis.mesh.nelements)
+        if self.region is not None:
+            cells = cells_in(self.region, basis.mesh, units.length, origin)
         if self.directions is None:
             frames = fibre_frames(material, basis.mesh.nelements)
         else:
@@ -89,12 +86,6 @@ class ActiveStress(FollowerLoad):
             slopes=torch.from_numpy(slopes),
             volumes=torch.from_numpy(dV[cells]),
         )
-
-    def _cells(self, mesh: skfem.Mesh, length: float, origin: Origin = 0.0) -> NDArray[np.int_]:
-        """Return the numbers of the cells, (S,)."""
-        if self.region is None:
-            return np.arange(mesh.nelements)
-        return cells_in(self.region, mesh, length, origin)
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,10 +70,6 @@ class FollowerLoad:
         stress = float(units.stress(np.array(one, dtype=np.float64), f"value = {self.value}"))
         return math.nan if ends else stress
 
-    def check(self, mesh: skfem.Mesh, units: Units) -> None:
-        """Check value and region on a mesh [m]; raise the errors of `on`."""
-        raise NotImplementedError
-
     def on(
         self,
         basis: skfem.Basis,

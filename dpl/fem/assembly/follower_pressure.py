@@ -42,10 +42,6 @@ class FollowerPressure(FollowerLoad):
     value: Stress
     name: str | None = None
 
-    def check(self, mesh: skfem.Mesh, units: Units) -> None:
-        self.dimensionless(units)
-        facets_in(self.region, mesh)
-
     def on(
         self,
         basis: skfem.Basis,

@@ -56,12 +56,15 @@ class Kernels:
         self.dV = dV
         self.places = _in_blocks(places)
         self.functions = None if functions is None else np.ascontiguousarray(functions)
+        self._law: Any = None
         self._set_law(material)
 
     def _set_law(self, material: CompiledLaw) -> None:
-        volumetric = self.functions is not None and material.finite
-        needs = max(required_terms(material), int(volumetric))
-        self._law = Law.of(material, element_loops.SOURCES), needs, float(material.finite)
+        law = Law.of(material, element_loops.SOURCES)
+        if self._law is None or self._law[0] != law:
+            volumetric = self.functions is not None and material.finite
+            needs = max(required_terms(material), int(volumetric))
+            self._law = law, needs, float(material.finite)
         self._constants = as_columns(material.constants)
         self._frames = frames_of(material)
         self._bulk = None if self.functions is None else as_columns([material.point_bulk])
