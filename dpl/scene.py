@@ -242,8 +242,8 @@ class Scene:
         fixed = int((~problem.free).any(dim=1).sum())
         moved = "moved" if problem.moved_supports else "fixed"
         springs = "" if problem.springs is None else ", an elastic foundation"
-        for term in problem.follower_loads.terms:
-            springs += f", {term.describe()}"
+        for part in problem.follower_loads.parts:
+            springs += f", {part.describe()}"
         for name, (low, high) in problem.follower_loads.ranges.items():
             springs += f", {name} from {low:.4g} to {high:.4g} Pa"
         force, displacement = self._largest_of_a_few()
@@ -292,7 +292,7 @@ class Scene:
             lines.append(f"one K(0) for all values of {names}: it is that without follower loads")
         if problem.springs is None:
             lines.append("no springs, nothing of theirs assembled")
-        if problem.equal_cells:
+        if problem.discretisation.equal_cells:
             lines.append(f"one set of shape gradients for {cells} equal cells")
         if points == 1:
             lines.append(f"one quadrature point for each of {cells} cells: gradients are constant")

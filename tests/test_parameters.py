@@ -122,7 +122,7 @@ def test_nothing_is_compiled_or_analysed_again(wide, monkeypatch):
     fem.solve(wide.solver, fem.Load(*(column[:1] for column in loads)))
     monkeypatch.setattr("dpl.fem.assembly.sparsity.Pattern.build", None)
     monkeypatch.setattr("dpl.fem.solvers.linear.make_backend", None)
-    monkeypatch.setattr("dpl.fem.problem.Kernels.__init__", None)
+    monkeypatch.setattr("dpl.fem.assembly.kernels.Kernels.__init__", None)
     monkeypatch.setattr("dpl.fem.assembly.kernels.Path", None)
     assert fem.solve(wide.solver, loads).converged.all()
 

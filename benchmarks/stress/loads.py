@@ -57,7 +57,7 @@ AMPLITUDES = (
 
 def newton_variants(problem: Problem) -> Iterator[tuple[str, Newton]]:
     """Yield Newton without and, where the law supports them, with mixed integration points."""
-    for mixed in (False, True) if problem.supports_mip else (False,):
+    for mixed in (False, True) if problem.material.has_response else (False,):
         yield ("mixed" if mixed else "plain"), Newton(problem, mixed_integration=mixed)
 
 

@@ -170,7 +170,7 @@ def ball_strain(cells: int, size: float, remote: Sequence[float]) -> tuple[Array
     fixed = (points < 1e-9) | outer[:, None]
     problem = build(fixed=fixed, prescribed=points * np.asarray(remote))
     u = balanced(Newton(problem)).displacement
-    strain = problem.strain(u)[0, mesh.subdomains["ball"]].diagonal(dim1=-2, dim2=-1)
+    strain = problem.tensors.strain(u)[0, mesh.subdomains["ball"]].diagonal(dim1=-2, dim2=-1)
     weights = problem.dV[mesh.subdomains["ball"]][..., None]
     mean: Tensor = (weights * strain).sum((0, 1)) / weights.sum()
     return mean.numpy(), float((strain - mean).abs().max() / mean.norm())

@@ -126,7 +126,7 @@ def expansion(nu: float, pressure: float, mesh: skfem.Mesh, degree: int, **optio
 
 def under_pressure(problem: Problem, factor: float, tol: float = 1e-10) -> Solution:
     """Return the equilibrium under a part of the pressure and no other load."""
-    newton = Newton(problem.with_follower_factor(factor), tol=tol)
+    newton = Newton(problem.under(factor), tol=tol)
     found = solve(newton, Load(torch.zeros(1, *problem.shape).double(), torch.ones(1)))
     assert found.converged.all(), str(Status(int(found.status)))
     return found
@@ -175,7 +175,7 @@ def energy_balance(
     nodes, weights = np.polynomial.legendre.leggauss(points)
     inner = [volume(under_pressure(problem, x).displacement) for x in (nodes + 1) / 2]
     u = under_pressure(problem, 1.0).displacement
-    strain = float(problem.without_follower_loads.energy(u))
+    strain = float(problem.tensors.energy(u))
     tip = u[0, problem.points[:, 0] > problem.points[:, 0].max() - 1e-9].mean(dim=0)
     return Balance(strain, volume(u) - float(weights @ inner) / 2, float(tip.norm()))
 

@@ -221,9 +221,6 @@ def _problem(cfg: DictConfig, young: float | None, follower: Mapping[str, Follow
         fixed = instantiate(cfg, "fixed") if cfg.get("fixed") is not None else None
         options = {key: cfg[key] for key in ("degree", "mean_dilatation")} | {"young": young}
         supports = _supports(cfg, mesh, Units(1.0, young))
-        for name, load in follower.items():
-            with error_in(f"forces.{name}"):
-                load.check(mesh, Units(1.0, young))
         options["regions"] = regions
         options["follower_loads"] = [
             replace(typing.cast("Any", load), name=load.name or name)

@@ -1,7 +1,9 @@
-"""Static equilibrium of a body: built from a mesh, evaluated and linearised by compiled loops."""
+"""Static equilibrium of a body: built from a mesh, evaluated and linearised."""
 
+import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -11,20 +13,26 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.assembly.boundary_conditions import Support, assemble_constraints
-from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients
-from dpl.fem.assembly.follower_loads import FollowerLoad, FollowerLoads
-from dpl.fem.assembly.kernels import GroupedKernels, Kernels
-from dpl.fem.assembly.mean_dilatation import CellVolumes, MixedGap, volume_gap
-from dpl.fem.assembly.variants import BodyVariants
+from dpl.fem.assembly.boundary_conditions import FoundationMatrix, Support, assemble_constraints
+from dpl.fem.assembly.discretisation import Discretisation
+from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients, locking_warnings
+from dpl.fem.assembly.equilibrium import relative_norm, relative_rounding
+from dpl.fem.assembly.follower_loads import NO_LOADS, FollowerLoad, FollowerLoads
+from dpl.fem.assembly.kernels import CompiledLoops
+from dpl.fem.assembly.mean_dilatation import CellVolumes
+from dpl.fem.assembly.recovery import Recovery
+from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_modes
+from dpl.fem.assembly.sparsity import Pattern
+from dpl.fem.assembly.tensor_assembly import TensorAssembly
 from dpl.fem.materials.heterogeneous import Heterogeneous
 from dpl.fem.materials.material import Material
-from dpl.fem.materials.tensors import volume_change
-from dpl.fem.mesh.generators import aspect_ratio, longest_side, near_origin
+from dpl.fem.mesh.generators import longest_side, near_origin
 from dpl.fem.mesh.regions import Region
+from dpl.fem.ranges import ParameterRange
 from dpl.fem.units import Units, check_young
 
 MIN_MIXED_VOLUME = 1e-3  # volume ratio of mixed integration points below which they are not used
+MAX_BODIES = 64  # bodies of other parameters that are kept
 
 
 class Evaluation(NamedTuple):
@@ -46,22 +54,75 @@ class System(NamedTuple):
         force: (B, N, D) [-].
         tangent: Entries of K on the pattern, (B, nnz) [-].
         valid: Whether the strains that it was made at are those of some deformation, (B,).
-        asymmetry: Function x -> (K - K^T) x / 2 at free degrees of freedom, (n,) to (n,), if a
-            follower load has no potential; `tangent` is then the symmetric part. Else None.
+        skew: Entries of (K - K^T) / 2 on the pattern, (B, nnz) [-], if a follower load has no
+            potential; `tangent` is then the symmetric part. None if K is symmetric.
     """
 
     force: Tensor
     tangent: Tensor
     valid: Tensor
-    asymmetry: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    skew: Tensor | None = None
 
 
-class Problem(BodyVariants):
-    """Static equilibrium of one body, see `TensorAssembly`; build it with `Problem.build`.
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Static equilibrium f_int(u) = f of a hyperelastic body; build it with `Problem.build`.
 
-    `evaluate`, `linearise` and `update_strain_gap` say what its tensor operations say, without
-    derivatives, by compiled loops where body and law have them.
+    All quantities are dimensionless. Methods take displacements (B, N, D) in float64. `energy`,
+    `internal_force`, `tangent`, `stress`, `tangent_product` and `volume_ratio` are differentiable
+    tensor operations on the device of the body. `evaluate`, `linearise` and `update_strain_gap`
+    have no derivatives and use compiled loops where the law has them.
+
+    `dataclasses.replace` makes a body with another law, other follower loads or other supports. It
+    shares everything that these do not change.
+
+    Attributes:
+        mesh: Geometry; coordinates relative to `origin`, divided by `length`.
+        degree: Polynomial degree of the displacement, 1 or 2.
+        material: The law.
+        length: L, longest side of the body [m].
+        origin: Origin of the coordinates over `length`, (D,) [-]. It is zero unless the body lies
+            farther from zero than its size. Nodes are at L (origin + points) [m].
+        points: Nodes (N, D) [-], for degree 2 including those of edges, faces and cells.
+        cells: Nodes of each cell, (E, A).
+        dN: Gradients of the shape functions, (E, Q, A, D) [-]; (1, Q, A, D) if all cells are equal.
+        dV: Volumes of the quadrature points, (E, Q) [-]; (1, Q) if all cells are equal.
+        free: Mask of the free degrees of freedom, (N, D).
+        prescribed: Displacement of the fixed ones at full load, (N, D) [-]; zero where free.
+        boundary: Mask of the nodes on the boundary, (N,).
+        springs: Elastic foundation (Robin conditions), or None.
+        follower_loads: Loads whose forces depend on the displacement: pressures, active stress.
+        volume_functions: Functions of the volume change in the cells, (E or 1, Q, M), see
+            `CellVolumes`; None without mean dilatation.
+        young: Young's modulus by which boundary values are divided [Pa]; None if there is no such
+            modulus, see `dpl.fem.units.Units`. No other quantity depends on it.
+        discretisation: What is computed from mesh and supports; a new one is made unless the given
+            one has the same mesh and free degrees of freedom.
     """
+
+    mesh: skfem.Mesh
+    degree: int
+    material: Material
+    length: float
+    origin: NDArray[np.float64]
+    points: Tensor
+    cells: Tensor
+    dN: Tensor
+    dV: Tensor
+    free: Tensor
+    prescribed: Tensor
+    boundary: Tensor
+    springs: FoundationMatrix | None = None
+    follower_loads: FollowerLoads = NO_LOADS
+    volume_functions: Tensor | None = None
+    young: float | None = 1.0
+    discretisation: Discretisation = field(default=None, repr=False)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        parts = {each.name: getattr(self, each.name) for each in fields(Discretisation)}
+        given = self.discretisation
+        if given is None or any(getattr(given, name) is not part for name, part in parts.items()):
+            object.__setattr__(self, "discretisation", Discretisation(**parts))
 
     @classmethod
     def build(
@@ -136,6 +197,9 @@ class Problem(BodyVariants):
         except ValueError as error:
             is_named = str(error).startswith(("material.", "regions:"))
             raise ValueError(f"{'' if is_named else 'material.'}{error}") from error
+        nu = material.largest_poisson_ratio
+        for line in locking_warnings(mesh, degree, nu, mean_dilatation=mean_dilatation):
+            warnings.warn(line, stacklevel=2)
         dN, dV = gradients(basis)
         functions = None
         if mean_dilatation:
@@ -144,7 +208,7 @@ class Problem(BodyVariants):
             functions = CellVolumes.of(*both, linear=degree == 2).functions
         boundary = np.zeros(basis.N, dtype=bool)
         boundary[basis.get_dofs(mesh.boundary_facets()).all()] = True
-        problem = cls(
+        return cls(
             mesh=mesh,
             degree=degree,
             material=material,
@@ -162,63 +226,28 @@ class Problem(BodyVariants):
             volume_functions=functions,
             young=young,
         )
-        for line in problem.locking_warnings():
-            warnings.warn(line, stacklevel=2)
-        return problem
 
-    def locking_warnings(self) -> list[str]:
-        """Return one line for each reason why linear elements will lock."""
-        lines, shape = [], self.mesh.elem.refdom.name.lower()
-        constant = self.dV.shape[1] == 1
-        nu = self.material.largest_poisson_ratio
-        if self.degree == 1 and nu >= 0.45 and self.volumes is None:
-            remedy = "degree=2" if constant else "degree=2 or mean_dilatation=true"
-            lines.append(f"linear {shape} elements lock at Poisson's ratio {nu:.4g}: set {remedy}")
-        aspect = float(aspect_ratio(self.mesh).max()) if self.degree == 1 else 0.0
-        if aspect > 20:
-            lines.append(
-                f"linear {shape} elements of aspect ratio {aspect:.0f} lock in bending: "
-                "set degree=2"
-            )
-        return lines
+    def __getstate__(self) -> dict[str, object]:
+        """Return the fields without cached properties."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
-    def restrict(self, field: Tensor) -> NDArray[np.float64]:
-        """Return the values, (n,), of a nodal field (N, D) at the free degrees of freedom."""
-        return field.numpy().reshape(-1)[self._free_numbers]
+    def to(self, device: torch.device | str) -> Self:
+        """Return the same body with its tensors on a device."""
+        tensors: dict[str, Any] = {
+            each.name: value.to(device)
+            for each in fields(self)
+            if isinstance(value := getattr(self, each.name), Tensor)
+        }
+        if self.springs is not None:
+            tensors["springs"] = FoundationMatrix(*(part.to(device) for part in self.springs))
+        return replace(self, **tensors, follower_loads=self.follower_loads.to(device))
 
-    def extend(self, values: NDArray[np.float64]) -> Tensor:
-        """Return the nodal field (N, D) with values (n,) where free and zero elsewhere."""
-        field = np.zeros(self.shape)
-        field.reshape(-1)[self._free_numbers] = values
-        return torch.from_numpy(field)
-
-    @cached_property
-    def _free_numbers(self) -> NDArray[np.int64]:
-        """Numbers of the free degrees of freedom, (n,)."""
-        return np.flatnonzero(self.free.numpy())
-
-    def residual(self, displacement: Tensor, force: Tensor) -> Tensor:
-        """Return f_int - f at free degrees of freedom, zero at fixed ones, (B, N, D) [-]."""
-        return torch.where(self.free, self.internal_force(displacement) - force, 0.0)
+    # ------------------------------------------------------------------ equilibrium
 
     def evaluate(self, displacement: Tensor) -> Evaluation:
         """Return internal force and min det F, without derivatives."""
-        if (kernels := self._kernels(displacement)) is None:
-            with torch.no_grad():
-                internal = self.internal_force(displacement)
-                return Evaluation(internal, self.volume_ratio(displacement))
-        displacement = displacement.detach().contiguous()
-        internal = torch.zeros(displacement.shape, dtype=torch.float64)
-        lowest = [
-            kernels.force(u.numpy(), out.numpy(), k)
-            for k, (u, out) in enumerate(zip(displacement, internal, strict=True))
-        ]
-        internal = self._with_boundary_forces(internal, displacement)
-        return Evaluation(internal, torch.tensor(lowest, dtype=torch.float64))
-
-    def relative_residual(self, displacement: Tensor, force: Tensor) -> Tensor:
-        """Return ||R_free|| / ||f||, (B,) [-], see `relative_residual_of`."""
-        return self.relative_residual_of(self.evaluate(displacement).internal, force)
+        internal, lowest = self._loops(displacement).evaluate(displacement)
+        return Evaluation(self._with_boundary_forces(internal, displacement), lowest)
 
     def linearise(self, displacement: Tensor, gap: Any = None) -> System:
         """Return the linearised equilibrium at (1, N, D), without derivatives.
@@ -227,58 +256,21 @@ class Problem(BodyVariants):
             displacement: u.
             gap: What `update_strain_gap` returned; None for plain Newton.
         """
-        if (kernels := self._kernels(displacement)) is None:
-            return self._reference_system(displacement, gap)
-        force = np.zeros(self.shape)
-        values = np.zeros(len(self.pattern.indices) + 1)
-        lowest = kernels.system(displacement[0].contiguous().numpy(), gap, force, values)
-        internal = self._with_boundary_forces(torch.from_numpy(force)[None], displacement)
-        tangent = self._with_boundary_entries(torch.from_numpy(values[:-1])[None], displacement)
-        valid = torch.tensor([lowest > MIN_MIXED_VOLUME])
-        return System(internal, tangent, valid, self._asymmetry(displacement))
-
-    def _asymmetry(
-        self, displacement: Tensor
-    ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-        """Return `System.asymmetry` at (1, N, D)."""
-        if self.has_potential:
-            return None
-        product = self.follower_loads.asymmetry(displacement)
-        return lambda x: self.restrict(product(self.extend(x)[None])[0])
-
-    def stiffness_at_rest(self) -> Tensor:
-        """Return the entries of K(0), (nnz,) [-], without follower loads.
-
-        The linear solution under follower loads is therefore that of dead loads on the body at
-        rest, and all their values share one factor.
-        """
-        rest = torch.zeros(1, *self.shape, dtype=torch.float64)
-        return self.without_follower_loads.linearise(rest).tangent[0]
-
-    @torch.no_grad()
-    def _reference_system(self, displacement: Tensor, gap: Any) -> System:
-        if gap is None:
-            force, tangent = self.internal_force(displacement), self.tangent(displacement)
-            valid = torch.ones(len(force), dtype=torch.bool)
-        else:
-            force, tangent = self.mixed_system(displacement, gap)
-            strain_gap = gap.strain if isinstance(gap, MixedGap) else gap
-            lowest = volume_change(2 * (self.strain(displacement) - strain_gap)).flatten(1).amin(1)
-            if self.volumes is not None:
-                change = volume_change(self.gradient(displacement))
-                mean = self.volumes.at_points(self.volumes.coefficients(change) - gap.volume)
-                lowest = torch.minimum(lowest, mean.flatten(1).amin(1))
-            valid = 1 + lowest > MIN_MIXED_VOLUME
-        return System(force, tangent, valid, self._asymmetry(displacement))
+        force, tangent, lowest = self._loops(displacement).linearise(displacement, gap)
+        with torch.no_grad():
+            internal = self._with_boundary_forces(force, displacement)
+            tangent, skew = self._with_boundary_entries(tangent, displacement)
+        return System(internal, tangent, lowest > MIN_MIXED_VOLUME, skew)
 
     def update_strain_gap(
         self, gap: Any, length: float, update: Tensor, displacement: Tensor | None = None
     ) -> Any:
         """Return the gap between the strain of u and that of mixed points after a step.
 
-        Points move with the strain's linear change along length * update and close as much of the
-        gap that there was; what the change is short of is the gap. With mean dilatation the same
-        holds for the volume changes of the cells, and the gap has two parts, see `MixedGap`.
+        The strain at a mixed point advances linearly with length * update, and by the same part of
+        the gap before the step. The gap is the difference to the strain of u. With mean dilatation
+        the same holds for the volume changes of the cells, and the gap has two parts, see
+        `MixedGap`.
 
         Args:
             gap: Before the step; None: none.
@@ -286,21 +278,10 @@ class Problem(BodyVariants):
             update: The full step, (1, N, D) [-].
             displacement: u after the step, (1, N, D) [-]; needed with mean dilatation only.
         """
-        if (kernels := self._kernels(update)) is not None:
-            u = None if displacement is None else displacement[0].contiguous().numpy()
-            return kernels.update_strain_gap(gap, length, update[0].contiguous().numpy(), u)
-        wider = length**2 * self.quadratic_strain(update)
-        if self.volumes is None or displacement is None:
-            return wider if gap is None else (1 - length) * gap + wider
-        step = length * self.gradient(update)
-        volume = volume_gap(self.gradient(displacement), step, self.volumes)
-        if gap is None:
-            return MixedGap(wider, volume)
-        left = 1 - length
-        return MixedGap(left * gap.strain + wider, left * gap.volume + volume)
+        return self._loops(update).update_strain_gap(gap, length, update, displacement)
 
-    def _kernels(self, displacement: Tensor) -> Kernels | GroupedKernels | None:
-        """Return the compiled loops, None where there are none.
+    def _loops(self, displacement: Tensor) -> CompiledLoops | TensorAssembly:
+        """Return the compiled loops, or the tensor operations where there are none.
 
         Raises:
             ValueError: The displacement is that of another body: the loops would run past its end.
@@ -311,24 +292,341 @@ class Problem(BodyVariants):
             raise ValueError(f"a displacement of shape {found} must have {wanted}")
         if displacement.dtype != torch.float64:
             raise ValueError(f"a displacement in {displacement.dtype} must be in torch.float64")
-        return self._compiled if displacement.device.type == "cpu" else None
+        return (self._compiled if displacement.device.type == "cpu" else None) or self.tensors
 
     @cached_property
-    def _compiled(self) -> Kernels | GroupedKernels | None:
-        groups = self.material.groups(len(self.cells))
-        laws = [law for law, _ in groups if law.compiled_form is not None]
-        if len(laws) < len(groups):
-            return None
-        first = self.__dict__.get("_first", self).reference
-        if first is not self and first._compiled is not None:
-            return first._compiled.with_moduli(laws)
-        places = self.pattern.places.reshape(len(self.cells), -1)
-        kernels = []
-        for law, (_, chosen) in zip(laws, groups, strict=True):
-            # An index by numbers copies: sending a problem to a worker moves the memory of tensors.
-            numbers = chosen.numpy()
-            own = [0] if self.equal_cells else numbers
-            dN, dV = self.dN.numpy()[own], self.dV.numpy()[own]
-            psi = None if self.volume_functions is None else self.volume_functions.numpy()[own]
-            kernels.append(Kernels(law, self.cells.numpy()[numbers], dN, dV, places[numbers], psi))
-        return kernels[0] if len(kernels) == 1 else GroupedKernels(kernels)
+    def _compiled(self) -> CompiledLoops | None:
+        return self.discretisation.compiled(self.material)
+
+    @cached_property
+    def tensors(self) -> TensorAssembly:
+        """Tensor operations of the cells alone, without foundation and follower loads."""
+        return TensorAssembly(self.discretisation, self.material)
+
+    def energy(self, displacement: Tensor) -> Tensor:
+        """Return the energy over E L^D, (B,) [-]: strain energy, foundation and follower loads.
+
+        The energy of a follower load is its potential only if it has one, see `has_potential`.
+        """
+        energy = self.tensors.energy(displacement)
+        if self.springs is not None:
+            pull = self.springs.force(displacement)
+            energy = energy + (pull * displacement).sum((-2, -1)) / 2
+        return energy + self.follower_loads.work(displacement) if self.follower_loads else energy
+
+    def internal_force(self, displacement: Tensor) -> Tensor:
+        """Return f_int, the gradient of the energy, (B, N, D) [-]; reactions at fixed nodes.
+
+        Follower loads are a part of f_int, because they depend on the displacement.
+        """
+        return self._with_boundary_forces(self.tensors.internal_force(displacement), displacement)
+
+    def tangent(self, displacement: Tensor) -> Tensor:
+        """Return the entries of K = d f_int / du on `pattern`, (B, nnz) [-].
+
+        If a follower load has no potential, K is the symmetric part.
+        """
+        return self._with_boundary_entries(self.tensors.tangent(displacement), displacement)[0]
+
+    def tangent_product(self, displacement: Tensor, direction: Tensor) -> Tensor:
+        """Return K(u) v on all degrees of freedom without assembling K, (B, N, D) [-]."""
+        return torch.func.jvp(self.internal_force, (displacement,), (direction,))[1]
+
+    def stress(self, displacement: Tensor) -> Tensor:
+        """Return the first Piola-Kirchhoff stress over E at the quadrature points, (B,E,Q,3,3)."""
+        return self.tensors.stress(displacement)
+
+    def volume_ratio(self, displacement: Tensor) -> Tensor:
+        """Return min det F over the quadrature points, (B,) [-]; a value <= 0 means inversion."""
+        return self.tensors.volume_ratio(displacement)
+
+    def _with_boundary_forces(self, internal: Tensor, displacement: Tensor) -> Tensor:
+        """Return internal forces (B, N, D) plus those of foundation and follower loads."""
+        if self.springs is not None:
+            internal = internal + self.springs.force(displacement)
+        if self.follower_loads:
+            internal = internal + self.follower_loads.force(displacement)
+        return internal
+
+    def _with_boundary_entries(
+        self, tangent: Tensor, displacement: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return entries (B, nnz) with foundation and follower loads, and the skew part."""
+        if self.springs is not None:
+            tangent = tangent + self._foundation_entries
+        if not self.follower_loads:
+            return tangent, None
+        added, skew = self.follower_loads.stiffness(displacement, self.pattern)
+        return tangent + added, skew
+
+    @cached_property
+    def _foundation_entries(self) -> Tensor:
+        """Entries of the stiffness of the elastic foundation on the pattern, (nnz,) [-]."""
+        rows, columns, stiffness = (part.cpu().numpy() for part in self.springs or ())
+        places = self.pattern.between(rows, columns)
+        added = np.bincount(places.ravel(), stiffness.ravel(), len(self.pattern.indices) + 1)
+        return torch.from_numpy(added[:-1]).to(self.points.device)
+
+    # ------------------------------------------------------------------ residual
+
+    def residual(self, displacement: Tensor, force: Tensor) -> Tensor:
+        """Return f_int - f at free degrees of freedom, zero at fixed ones, (B, N, D) [-]."""
+        return torch.where(self.free, self.internal_force(displacement) - force, 0.0)
+
+    def relative_residual(self, displacement: Tensor, force: Tensor) -> Tensor:
+        """Return ||R_free|| / ||f||, (B,) [-], see `relative_residual_of`."""
+        return self.relative_residual_of(self.evaluate(displacement).internal, force)
+
+    def relative_residual_of(self, internal: Tensor, force: Tensor) -> Tensor:
+        """Return ||R_free|| / ||f||, (B,) [-], the criterion of equilibrium of all solvers.
+
+        ||f|| is the norm of the forces on free degrees of freedom. Forces on fixed ones do no
+        work and change no displacement, so they do not count. Where supports are moved, reactions
+        do work: ||f|| is then at least the norm of the reactions on the degrees of freedom whose
+        prescribed displacement is not 0. Reactions of supports that are not moved never count.
+        Under follower loads ||f|| is at least the norm of their nodal forces on the body at rest,
+        a measure that does not change with the displacement.
+
+        Without forces the result is ||R_free|| itself. It is NaN for a force that is not finite,
+        also on fixed degrees of freedom, and for one too small to compute with, see
+        `relative_norm`.
+
+        Source: OptiStruct 2020, Nonlinear Convergence Criteria (its relative error in loads counts
+        "nodal reactions due to specified displacements").
+
+        Args:
+            internal: f_int, (B, N, D) [-].
+            force: f, (B, N, D) [-].
+        """
+        return self._measured(internal, force)[0]
+
+    def is_equilibrium(
+        self, displacement: Tensor, internal: Tensor, force: Tensor, tol: float
+    ) -> Tensor:
+        """Return True where the relative residual is below tol or the roundoff bound, (B,)."""
+        ratio, scale = self._measured(internal, force)
+        return (ratio < tol) | (
+            (ratio < 1e-4) & (ratio * scale <= self.roundoff_bound(displacement))
+        )
+
+    def _measured(self, internal: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `relative_residual_of` and the ||f|| that it is relative to, (B,) [-]."""
+        loads = [self.acting(force).flatten(1)]
+        if self.moved_supports:
+            loads.append((internal * (self.prescribed != 0)).flatten(1))
+        if self.follower_loads:
+            at_rest = self.force_at_rest.reshape(-1, *self.shape)
+            loads.append(self.acting(at_rest).flatten(1))
+        return relative_norm(self.acting(internal - force).flatten(1), loads)
+
+    def acting(self, force: Tensor) -> Tensor:
+        """Return a force (B, N, D) [-] at free degrees of freedom, where it has an effect.
+
+        At fixed ones the result is 0, or NaN where the force is not finite.
+        """
+        return force * self.free
+
+    def roundoff_bound(self, displacement: Tensor) -> Tensor:
+        """Return a bound of the rounding error of ||R_free||, (B,) [-]."""
+        return self._rounding * displacement.abs().amax(dim=(1, 2))
+
+    @cached_property
+    def _rounding(self) -> Tensor:
+        return relative_rounding(self.discretisation, self.material)
+
+    # ------------------------------------------------------------------ the body at rest
+
+    def stiffness_at_rest(self) -> Tensor:
+        """Return the entries of K(0), (nnz,) [-], without follower loads.
+
+        The linear solution under follower loads is therefore that of dead loads on the body at
+        rest, and all their values share one factor.
+        """
+        rest = torch.zeros(1, *self.shape, dtype=torch.float64)
+        return replace(self, follower_loads=NO_LOADS).linearise(rest).tangent[0]
+
+    @cached_property
+    def force_at_rest(self) -> Tensor:
+        """f_int at u = 0: the force of the follower loads on the body at rest, (N, D) [-].
+
+        It is minus the nodal forces of dead loads; zero without follower loads. (B, N, D) if each
+        member of a batch has its own stresses.
+        """
+        forces = self.follower_loads.force(self.points.new_zeros(1, *self.shape))
+        return forces[0] if len(forces) == 1 else forces
+
+    @cached_property
+    def support_force(self) -> Tensor:
+        """K(0) times the prescribed displacement plus the follower loads at rest, (N, D) [-]."""
+        if not self.moved_supports:
+            return self.force_at_rest
+        rest, moved = self.prescribed.new_zeros(1, *self.shape), self.prescribed[None]
+        body = replace(self, follower_loads=NO_LOADS)
+        return body.tangent_product(rest, moved)[0] + self.force_at_rest
+
+    @property
+    def is_loaded_at_rest(self) -> bool:
+        """True if u = 0 is no equilibrium without forces: moved supports, follower loads."""
+        return self.moved_supports or bool(self.force_at_rest.any())
+
+    @cached_property
+    def moved_supports(self) -> bool:
+        """True if a prescribed displacement is not zero."""
+        return bool((self.prescribed != 0).any())
+
+    @cached_property
+    def has_potential(self) -> bool:
+        """True if the tangent is symmetric under the follower loads, whatever their values.
+
+        The stiffness of a follower load is at most linear in u, so that one random displacement
+        decides.
+        """
+        random = torch.Generator().manual_seed(0)
+        noise = torch.rand(1, *self.shape, generator=random, dtype=torch.float64) - 0.5
+        u = torch.where(self.free, 0.1 * noise.to(self.free.device), 0.7 * self.prescribed)
+        return self.follower_loads.generic.stiffness(u, self.pattern)[1] is None
+
+    # ------------------------------------------------------------------ parameters
+
+    @property
+    def parameter_ranges(self) -> dict[str, ParameterRange]:
+        """Ranges of what differs between loads beside forces and Young's modulus, by name.
+
+        They are the ranges of the law [-], then those of follower loads [Pa].
+        """
+        return {**self.material.parameter_ranges, **self.follower_loads.ranges}
+
+    def law_parameters(self, parameters: Tensor) -> Tensor:
+        """Return those of the parameters (B, P) that belong to the law."""
+        return parameters[:, : len(self.material.parameter_ranges)]
+
+    def with_parameters(self, parameters: Tensor) -> Self:
+        """Return the problem with other parameters; mesh, pattern and kernels are shared.
+
+        Args:
+            parameters: Values of `parameter_ranges`, (B, P). P = 0 returns the problem itself. With
+                B > 1 each member of a batch has its own: such a problem has energies, forces and
+                residuals, but no tangent. It is differentiable in parameters that require a
+                gradient.
+
+        Raises:
+            ValueError: The problem has another number of ranges, or the law does not allow a value.
+        """
+        ranges = self.parameter_ranges
+        if parameters.shape[-1] != len(ranges):
+            raise ValueError(
+                f"a load has {parameters.shape[-1]} parameters and the body has ranges of "
+                f"{list(ranges)}; give Load(force, young, parameters) one value for each"
+            )
+        if not ranges:
+            return self
+        parameters = parameters.to(self.points.device, torch.float64)
+        if len(parameters) > 1 or parameters.requires_grad:
+            return self._with_values(parameters)
+        values = tuple(parameters[0].tolist())
+        if values not in self._bodies:
+            if len(self._bodies) >= MAX_BODIES:
+                self._bodies.pop(next(iter(self._bodies)))
+            self._bodies[values] = self._with_values(parameters)
+        return self._bodies[values]
+
+    def _with_values(self, parameters: Tensor) -> Self:
+        """Return the problem with values (B, P) in place of all ranges."""
+        law, loads = self.material, self.follower_loads
+        if loads.ranges and self.young is not None:
+            loads = loads.with_values(parameters[:, len(law.parameter_ranges) :] / self.young)
+        law = law.with_parameters(self.law_parameters(parameters))
+        return replace(self, material=law, follower_loads=loads)
+
+    @cached_property
+    def _bodies(self) -> dict[tuple[float, ...], Self]:
+        return {}
+
+    @cached_property
+    def reference(self) -> Self:
+        """The problem at the middle of all ranges; itself without a range.
+
+        Modes, scales and largest loads are those of this problem.
+        """
+        ranges = self.parameter_ranges.values()
+        return self.with_parameters(torch.tensor([[ends.middle for ends in ranges]]).double())
+
+    def under(self, factor: float) -> Self:
+        """Return the body under `factor` times its follower loads."""
+        if not self.follower_loads or factor == 1:
+            return self
+        return replace(self, follower_loads=self.follower_loads.scaled(factor))
+
+    # ------------------------------------------------------------------ units and parts
+
+    @property
+    def units(self) -> Units:
+        """L and E, by which boundary values are divided."""
+        return Units(self.length, self.young)
+
+    @property
+    def has_one_modulus(self) -> bool:
+        """True if the body is divided by one modulus: elastic foundation or follower loads."""
+        return self.springs is not None or bool(self.follower_loads)
+
+    def check_modulus(self, young: float) -> None:
+        """Check the Young's modulus [Pa] of a load on this body.
+
+        Elastic foundations have a fixed stiffness and follower loads a fixed stress, so that
+        their parts in f_int are those of one modulus. Other bodies allow all moduli.
+
+        Raises:
+            ValueError: The modulus is not that of the foundation or the follower loads.
+        """
+        if not self.has_one_modulus or self.young is None or math.isclose(young, self.young):
+            return
+        part = self.follower_loads.kinds
+        part = part if self.springs is None else "stiffness of the elastic foundation"
+        raise ValueError(
+            f"young = {young:g} must be {self.young:g} [Pa], by which the {part} is divided; "
+            f"build another body with young = {young:g}"
+        )
+
+    @property
+    def mesh_in_metres(self) -> skfem.Mesh:
+        """The mesh in the coordinates of the user [m]."""
+        return self.mesh.scaled(self.length).translated(self.length * self.origin)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """N and D."""
+        return self.discretisation.shape
+
+    @property
+    def basis(self) -> skfem.Basis:
+        """scikit-fem's basis of one displacement component."""
+        return self.discretisation.basis
+
+    @property
+    def pattern(self) -> Pattern:
+        """Sparsity pattern of the tangent."""
+        return self.discretisation.pattern
+
+    @property
+    def recovery(self) -> Recovery:
+        """Values at nodes from values at quadrature points."""
+        return self.discretisation.recovery
+
+    @property
+    def near_null(self) -> NDArray[np.float64]:
+        """Near-null space for multigrid: rigid body modes at free degrees of freedom, (n, k)."""
+        return rigid_body_modes(self.points)[0][self.free].numpy()
+
+    def unconstrained_rigid_body_modes(self) -> list[str]:
+        """Return the names of the rigid body modes that no boundary condition constrains."""
+        return unconstrained_modes(self.points, self.free, self.springs)
+
+    def restrict(self, field: Tensor) -> NDArray[np.float64]:
+        """Return the values, (n,), of a nodal field (N, D) at the free degrees of freedom."""
+        return field.numpy().reshape(-1)[self.discretisation.free_numbers]
+
+    def extend(self, values: NDArray[np.float64]) -> Tensor:
+        """Return the nodal field (N, D) with values (n,) where free and zero elsewhere."""
+        field = np.zeros(self.shape)
+        field.reshape(-1)[self.discretisation.free_numbers] = values
+        return torch.from_numpy(field)

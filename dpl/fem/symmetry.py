@@ -11,6 +11,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
+from dpl.fem.assembly.follower_loads import NO_LOADS
+from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
 
 Array = NDArray[np.float64]
@@ -134,15 +136,25 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> SymmetryGrou
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
     """Return the operators that commute with a symmetry: constraints, cells and loads."""
-    loads = [term.generic.force for term in problem.follower_loads.terms]
+    loads = [problem.follower_loads.generic.force] if problem.follower_loads else []
     springs = [] if problem.springs is None else [problem.springs.force]
-    body = problem.generic.without_follower_loads
-    cells = body if problem.springs is None else replace(body, springs=None)
+    law = _generic(problem.material)
+    cells = replace(problem, material=law, springs=None, follower_loads=NO_LOADS)
     operators: list[Callable[[Tensor], Tensor]] = [
         lambda field: torch.where(problem.free, field, 0.0),
         lambda field: cells.evaluate(field).internal,
     ]
     return [*operators, *springs, *loads]
+
+
+def _generic(law: Material) -> Material:
+    """Return a law with parameters of which no two are equal fractions of their ranges.
+
+    Laws of two regions are equal for these parameters only if they are for all.
+    """
+    ranges = list(law.parameter_ranges.values())
+    values = [ends.at((k + 1) / (len(ranges) + 1)) for k, ends in enumerate(ranges)]
+    return law.with_parameters(torch.tensor([values], dtype=torch.float64))
 
 
 def _fields(problem: Problem, points: Array) -> Tensor:

@@ -62,11 +62,23 @@ class LinearBase:
         force = load.force.double()
         free = self._problem.free.to(force.device)
         if self._problem.follower_loads.ranges:
-            force = force - self._problem.ranged_force_at_rest(load.parameters.to(force))
+            force = force - self._ranged_forces(load.parameters.to(force))
         values = self._response(force[:, free], self._problem.law_parameters(load.parameters))
         prescribed = self._problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
         dofs = free.flatten().nonzero()[:, 0]
         return prescribed.index_copy(1, dofs, values).view_as(force)
+
+    def _ranged_forces(self, parameters: Tensor) -> Tensor:
+        """Return f_int at u = 0 of the follower loads with a range alone, (B, N, D) [-]."""
+        problem = self._problem
+        stresses = parameters[:, len(problem.material.parameter_ranges) :] / (problem.young or 1.0)
+        return torch.einsum("br,rnd->bnd", stresses, self._unit_forces.to(stresses))
+
+    @cached_property
+    def _unit_forces(self) -> Tensor:
+        """f_int at u = 0 of each follower load with a range at a stress of E, (R, N, D) [-]."""
+        problem = self._problem
+        return problem.follower_loads.unit_forces(problem.points.new_zeros(1, *problem.shape))
 
     def scale_inputs(self, linear: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
         """Return v / rms(v), (B, N, D), and amplitudes a, (B,), float64.

@@ -1,6 +1,7 @@
 """The linear solution K(0)^-1 f of every load, by nested static condensation."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -61,7 +62,8 @@ class LinearResponse:
     @cached_property
     def terms(self) -> StiffnessTerms:
         """Terms of K(0) of the body."""
-        return StiffnessTerms.of(self._scene.problem.without_ranged_loads)
+        problem = self._scene.problem
+        return StiffnessTerms.of(replace(problem, follower_loads=problem.follower_loads.constant))
 
     @cached_property
     def _form(self) -> OrbitForm:

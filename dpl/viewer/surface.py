@@ -70,7 +70,7 @@ class Surface:
         body = self.problem
         cells, recovery = body.recovery.restricted_to(self.nodes)
         chosen = torch.from_numpy(cells)
-        if body.equal_cells:
+        if body.discretisation.equal_cells:
             return replace(body, cells=body.cells[chosen]), recovery
         parts = {name: getattr(body, name)[chosen] for name in ("cells", "dN", "dV")}
         return replace(body, **parts), recovery

@@ -242,7 +242,7 @@ def test_an_active_stress_has_the_name_of_the_force_and_the_directions_of_the_la
     scene = scene_of(BAR[0], *BAR[-2:], *law, own)
     assert scene.loads.parameter_ranges == {"muscle": (0.0, 45.0)}
     assert "muscle from 0 to 45 Pa" in dict(scene.describe())["supports"]
-    force = scene.problem.ranged_force_at_rest(torch.tensor([[45.0]]).double())[0]
+    force = scene.problem.with_parameters(torch.tensor([[45.0]]).double()).force_at_rest
     expected = scene_of(*BAR, MUSCLE).problem.force_at_rest
     torch.testing.assert_close(force, expected, rtol=1e-9, atol=1e-14)
 

@@ -150,7 +150,7 @@ def test_crooked_patch_of_any_element_passes(law, cell, degree, grid):
     mesh = grid(cell, 3, 0.2, inside=True)
     dim = mesh.dim()
     problem = stretched(mesh, law, [row[:dim] for row in GENERAL[:dim]], degree)
-    assert not problem.equal_cells
+    assert not problem.discretisation.equal_cells
     check_patch(problem, at_rest(problem))
 
 

@@ -169,11 +169,11 @@ def test_compiled_loops_say_what_tensors_say(body, steepness, seed, length):
     change = gradients(problem, u).norm(dim=(-2, -1)).max()
     assert (found.volume_ratio - problem.volume_ratio(u)).abs() <= 10 * EPS * (1 + change)
     steps = [(problem.linearise(u), (problem.internal_force(u), problem.tangent(u)))]
-    if problem.supports_mip:
+    if problem.material.has_response:
         update = 0.3 * bent(problem, steepness, seed ^ 1)
         gap = problem.update_strain_gap(None, length, update)
-        exact = length**2 * problem.quadratic_strain(update)
-        steps.append((problem.linearise(u, gap), problem.mixed_system(u, exact)))
+        exact = problem.tensors.update_strain_gap(None, length, update)
+        steps.append((problem.linearise(u, gap), problem.tensors.mixed_system(u, exact)))
     unit = slack(problem, torch.ones_like(u))  # of forces where all displacements are 1
     for system, (force, tangent) in steps:
         assert system.valid.all()

@@ -29,7 +29,7 @@ def by_hand(problem: Problem, prediction, batch):
     residual = sorted(
         np.linalg.norm((internal[s] - f[s])[free]) / np.linalg.norm(f[s]) for s in range(loads)
     )
-    F = problem.gradient(prediction).numpy() + np.eye(3)
+    F = problem.discretisation.gradient(prediction).numpy() + np.eye(3)
     return {
         "e_mean": sum(whole) / (nodes * dim * loads),
         "e_max": max(np.linalg.norm(u[s, i] - v[s, i]) for s in range(loads) for i in range(nodes)),

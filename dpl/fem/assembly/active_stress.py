@@ -2,18 +2,17 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import skfem
 import torch
-from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.assembly.elements import gradients
-from dpl.fem.assembly.follower_loads import CONSTANT, FollowerLoad, FollowerTerm, Stress
+from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Stress, entry_map
 from dpl.fem.assembly.sparsity import Pattern
-from dpl.fem.identity import plain
 from dpl.fem.materials.fibres.reinforced import FibreDirections, fibre_frames
 from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin, Region, cells_in
@@ -47,27 +46,21 @@ class ActiveStress(FollowerLoad):
     directions: FibreDirections | None = None
     name: str | None = None
 
-    def check(self, mesh: skfem.Mesh, units: Units) -> None:
-        """See `FollowerLoad.check`."""
-        self.dimensionless(units)
-        self._cells(mesh, units.length)
-
     def on(
         self,
         basis: skfem.Basis,
         units: Units,
         material: Material,
         origin: Origin = 0.0,
-        column: int = CONSTANT,
     ) -> "ActiveFibres":
         """Return the active fibres, see `FollowerLoad.on`.
 
         Raises:
-            ValueError: The region contains no cell, no fibre directions are known in one of its
-                cells, or `value` is invalid.
+            ValueError: The region contains no cell, or no fibre directions are known in one.
         """
-        tension = self.dimensionless(units)
-        cells = self._cells(basis.mesh, units.length, origin)
+        cells = np.arange(basis.mesh.nelements)
+        if self.region is not None:
+            cells = cells_in(self.region, basis.mesh, units.length, origin)
         if self.directions is None:
             frames = fibre_frames(material, basis.mesh.nelements)
         else:
@@ -88,27 +81,19 @@ class ActiveStress(FollowerLoad):
         slopes = (dN[cells] @ fibre[..., None])[..., 0]
         return ActiveFibres(
             nodes=torch.from_numpy(basis.element_dofs.T[cells].astype(np.int64)),
-            value=torch.full((len(cells),), tension, dtype=torch.float64),
-            column=torch.full((len(cells),), column),
             cells=torch.from_numpy(cells.astype(np.int64)),
             fibre=torch.from_numpy(fibre),
             slopes=torch.from_numpy(slopes),
             volumes=torch.from_numpy(dV[cells]),
         )
 
-    def _cells(self, mesh: skfem.Mesh, length: float, origin: Origin = 0.0) -> NDArray[np.int_]:
-        """Return the numbers of the cells, (S,)."""
-        if self.region is None:
-            return np.arange(mesh.nelements)
-        return cells_in(self.region, mesh, length, origin)
-
 
 @dataclass(frozen=True, eq=False)
-class ActiveFibres(FollowerTerm):
-    """Cells with active fibres. `value` is T / E.
+class ActiveFibres(LoadedPart):
+    """Cells with active fibres of the tension T = E.
 
-    The nodal force is affine in the displacement: T times the integral of (grad N_a . f) F f, with
-    F f = f + du/df. Its derivative is T times the integral of (grad N_a . f)(grad N_b . f) for each
+    The nodal force is affine in the displacement: the integral of (grad N_a . f) F f, with
+    F f = f + du/df. Its derivative is the integral of (grad N_a . f)(grad N_b . f) for each
     component of the displacement: constant and symmetric.
 
     Attributes:
@@ -120,47 +105,44 @@ class ActiveFibres(FollowerTerm):
 
     kind: ClassVar[str] = "active stress"
     key: ClassVar[str] = "active_stress"
-    independent: ClassVar[tuple[str, ...]] = ("_unit_stiffness",)
     cells: Tensor
     fibre: Tensor
     slopes: Tensor
     volumes: Tensor
 
-    def identity(self) -> list[Any]:
-        """See `FollowerTerm.identity`; with the fibre directions."""
-        return [*super().identity(), plain(self.fibre)]
+    @property
+    def directions(self) -> Tensor:
+        return self.fibre
 
     def describe(self) -> str:
-        """See `FollowerTerm.describe`."""
-        return f"active stress in {len(self.cells.unique()):,} cells"
+        return f"active stress in {len(self.cells):,} cells"
 
     def force(self, displacement: Tensor) -> Tensor:
         """Return the part of the internal force, (B, N, D) [-]."""
         image = self.fibre + self.slopes @ displacement[:, self.nodes]  # F f
         forces = (self.slopes * self.volumes[..., None]).mT @ image
-        return self._sum_at_nodes(forces * self.value[..., None, None], displacement)
+        return self._sum_at_nodes(forces, displacement)
 
     def work(self, displacement: Tensor) -> Tensor:
-        """Return the energy, the integral of T/2 f.(C - I) f, (B,) [-]."""
+        """Return the energy, the integral of f.(C - I) f / 2, (B,) [-]."""
         change = self.slopes @ displacement[:, self.nodes]  # du/df, (B, S, Q, D)
         strain = ((self.fibre + change / 2) * change).sum(-1)
-        return ((strain * self.volumes).sum(-1) * self.value).sum(-1)
+        return (strain * self.volumes).sum((-2, -1))
 
-    def stiffness(self, displacement: Tensor) -> Tensor:
+    def stiffness(self, displacement: Tensor) -> list[Tensor]:
         """Return entries of d force / du for pairs of nodes a <= b, b slowest, (B, M) [-]."""
-        entries = (self.value[..., None] * self._unit_stiffness).flatten(-2)
-        return entries.expand(len(displacement), -1)
+        return [self._stiffness.expand(len(displacement), -1)]
 
     @cached_property
-    def _unit_stiffness(self) -> Tensor:
-        """`stiffness` of T = E for pairs of nodes, (S, A (A + 1)/2) [-]."""
+    def _stiffness(self) -> Tensor:
+        """`stiffness` for one displacement, (S A (A + 1)/2,) [-]."""
         matrices = (self.slopes * self.volumes[..., None]).mT @ self.slopes
         b, a = np.tril_indices(self.nodes.shape[1])
-        return matrices[:, a, b]
+        return matrices[:, a, b].flatten()
 
-    def places(self, pattern: Pattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """See `FollowerTerm.places`."""
+    def maps(self, pattern: Pattern) -> list[csr_array]:
+        """Return the map of the entries, which are equal for all components."""
         own = pattern.places[self.cells.cpu().numpy()]  # (S, pairs, D, D)
-        target = own.diagonal(axis1=-2, axis2=-1).astype(np.int64)
-        source = np.arange(target[..., 0].size).repeat(target.shape[-1])
-        return source, target.flatten()
+        target = own.diagonal(axis1=-2, axis2=-1).reshape(-1, own.shape[-1])
+        source = np.broadcast_to(np.arange(len(target))[:, None], target.shape)
+        return [entry_map(pattern, target, source, np.ones(target.shape))]

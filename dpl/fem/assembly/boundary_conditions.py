@@ -28,11 +28,7 @@ class DirichletBC:
     value: Sequence[float | None] | None = None
 
     def dimensionless(self, dim: int, units: Units) -> NDArray[np.float64]:
-        """Return g / L, (D,) [-], NaN where a component is free.
-
-        Raises:
-            ValueError: `value` does not have D entries, or all of them are None.
-        """
+        """Return g / L, (D,) [-], NaN where a component is free."""
         value = [0.0] * dim if self.value is None else list(self.value)
         given = [math.nan if g is None else units.displacement(float(g)) for g in value]
         if len(given) != dim or all(map(math.isnan, given)) or any(map(math.isinf, given)):
@@ -46,9 +42,6 @@ class DirichletBC:
             basis: Scalar basis of a body, its coordinates divided by L.
             units: L and E.
             origin: Origin of these coordinates, (D,) [-].
-
-        Raises:
-            ValueError: The region contains no node, or `value` is invalid, see `dimensionless`.
         """
         given = self.dimensionless(basis.mesh.dim(), units)
         where = nodes_in(self.region, basis, units.length, origin)
@@ -68,11 +61,7 @@ class RobinBC:
     stiffness: float | Sequence[float]
 
     def dimensionless(self, dim: int, units: Units) -> NDArray[np.float64]:
-        """Return alpha L / E, (D,) [-].
-
-        Raises:
-            ValueError: `stiffness` is out of range, or the loads have a range of moduli.
-        """
+        """Return alpha L / E, (D,) [-]."""
         words = f"stiffness = {self.stiffness}"
         one = isinstance(self.stiffness, int | float)
         stiffness = np.array([self.stiffness] * dim if one else self.stiffness, dtype=np.float64)
@@ -85,12 +74,7 @@ class RobinBC:
         return units.stress_gradient(stiffness, words)
 
     def on(self, basis: skfem.Basis, units: Units, origin: Origin = 0.0) -> "FoundationMatrix":
-        """Return the stiffness matrix over E L^(D - 2); arguments as in `DirichletBC.on`.
-
-        Raises:
-            ValueError: The region contains no boundary facet, or `stiffness` is invalid, see
-                `dimensionless`.
-        """
+        """Return the stiffness matrix over E L^(D - 2); arguments as in `DirichletBC.on`."""
         stiffness = self.dimensionless(basis.mesh.dim(), units)
         facets = facets_in(self.region, basis.mesh, units.length, origin)
         boundary = skfem.FacetBasis(basis.mesh, basis.elem, facets=facets, intorder=4)

@@ -4,6 +4,8 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 
+from dpl.fem.mesh.generators import aspect_ratio
+
 # shape of the cell, degree -> element, polynomial degree that the quadrature integrates exactly.
 # Full integration: fewer points leave hourglass modes.
 ELEMENTS = {
@@ -79,3 +81,28 @@ def gradients(basis: skfem.Basis) -> tuple[NDArray[np.float64], NDArray[np.float
     same = np.allclose(dN, dN[:1], rtol=0, atol=1e-11 * np.abs(dN).max())
     equal = same and np.allclose(dV, dV[:1], rtol=1e-11)
     return (dN[:1], dV[:1]) if equal else (dN, dV)
+
+
+def locking_warnings(
+    mesh: skfem.Mesh, degree: int, poisson: float, *, mean_dilatation: bool
+) -> list[str]:
+    """Return one line for each reason why the elements of a body will lock.
+
+    Args:
+        mesh: The cells.
+        degree: Polynomial degree of the displacement; only linear elements lock.
+        poisson: Largest Poisson's ratio [-].
+        mean_dilatation: Whether the volume ratio is projected in each cell.
+    """
+    if degree == 2:
+        return []
+    lines, shape = [], mesh.elem.refdom.name.lower()
+    if poisson >= 0.45 and not mean_dilatation:
+        can_project = shape in ("quadrilateral", "hexahedral")
+        remedy = "degree=2 or mean_dilatation=true" if can_project else "degree=2"
+        lines.append(f"linear {shape} elements lock at Poisson's ratio {poisson:.4g}: set {remedy}")
+    if (aspect := float(aspect_ratio(mesh).max())) > 20:
+        lines.append(
+            f"linear {shape} elements of aspect ratio {aspect:.0f} lock in bending: set degree=2"
+        )
+    return lines

@@ -4,14 +4,15 @@ Their nodal forces depend on the displacement and are a part of the internal for
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
 import skfem
 import torch
-from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.assembly.sparsity import Pattern
@@ -22,9 +23,7 @@ from dpl.fem.ranges import ParameterRange, is_range
 from dpl.fem.units import Units
 
 Stress = float | Sequence[float] | Mapping[str, float | str]  # number or range
-CONSTANT = -1  # `FollowerTerm.column` of a load that is one number
-
-Places = Sequence[tuple[Tensor, Tensor]]
+ASYMMETRIC = 1e-10  # part of the largest entry above which a skew part is no rounding [-]
 
 
 class FollowerLoad:
@@ -49,11 +48,7 @@ class FollowerLoad:
 
     @property
     def range(self) -> ParameterRange | None:
-        """Range of the stress [Pa]; None if it is one number.
-
-        Raises:
-            ValueError: `value` is neither a finite number nor a range.
-        """
+        """Range of the stress [Pa]; None if it is one number."""
         if is_range(self.value):
             try:
                 return ParameterRange.of("value", self.value)
@@ -69,20 +64,11 @@ class FollowerLoad:
         return None
 
     def dimensionless(self, units: Units) -> float:
-        """Return the stress over E [-]; NaN for a range, until a load says which.
-
-        Raises:
-            ValueError: `value` is neither a finite number nor a range, or the loads have a range
-                of moduli.
-        """
+        """Return the stress over E [-]; NaN for a range, until a load says which."""
         ends = self.range
         one = ends[0] if ends else self.value
         stress = float(units.stress(np.array(one, dtype=np.float64), f"value = {self.value}"))
         return math.nan if ends else stress
-
-    def check(self, mesh: skfem.Mesh, units: Units) -> None:
-        """Check value and region on a mesh [m]; raise the errors of `on`."""
-        raise NotImplementedError
 
     def on(
         self,
@@ -90,84 +76,42 @@ class FollowerLoad:
         units: Units,
         material: Material,
         origin: Origin = 0.0,
-        column: int = CONSTANT,
-    ) -> "FollowerTerm":
-        """Return the nodal forces on a body.
+    ) -> "LoadedPart":
+        """Return the loaded facets or cells of a body.
 
         Args:
             basis: Scalar basis of the body, its coordinates divided by L.
             units: L and E.
             material: Law of the body, after `Material.on`.
             origin: Origin of the coordinates, (D,) [-].
-            column: See `FollowerTerm.column`.
-
-        Raises:
-            ValueError: The load does not fit the body, or `value` is invalid, see `dimensionless`.
         """
         raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
-class FollowerTerm:
-    """Nodal forces of all follower loads of one kind on a body, evaluated in batches.
+class LoadedPart:
+    """Facets or cells under a follower load: nodal forces, work and stiffness of a stress of E.
 
     Attributes:
         nodes: Nodes of each loaded facet or cell, (S, A).
-        value: Stress over E on each facet or cell, (S,) [-], or (B, S) for each member of a batch.
-        column: Number of the load with a range that acts on each facet or cell, (S,); `CONSTANT`
-            where the load is one number.
     """
 
     kind: ClassVar[str]  # name in messages
     key: ClassVar[str]  # name in the identity of a scene
-    independent: ClassVar[tuple[str, ...]]  # cached properties that do not depend on `value`
     nodes: Tensor
-    value: Tensor
-    column: Tensor
-
-    @classmethod
-    def join(cls, terms: Sequence[Self]) -> Self:
-        """Return the sum of several terms as one."""
-        return cls(*(torch.cat([getattr(t, f.name) for t in terms]) for f in fields(cls)))
 
     def to(self, device: torch.device | str) -> Self:
-        """Return the term with its tensors on a device."""
+        """Return the part with its tensors on a device."""
         return type(self)(*(getattr(self, field.name).to(device) for field in fields(self)))
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields without cached properties."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def identity(self) -> list[Any]:
-        """Return facets or cells and stresses as plain data, arrays as their SHA-256."""
-        loaded = [plain(self.nodes.sort(dim=1).values), plain(self.value.nan_to_num())]
-        return [*loaded, plain(self.column)] if self.n_ranges else loaded
-
     @property
-    def n_ranges(self) -> int:
-        """1 plus the largest `column`: number of ranges up to the last of this term."""
-        return int(self.column.max()) + 1
-
-    def scaled(self, factor: float) -> Self:
-        """Return the term of `factor` times its stresses."""
-        return self._with_value(factor * self.value)
-
-    def with_values(self, values: Tensor) -> Self:
-        """Return the term with stresses over E in place of the ranges, (1, P) or (B, P) [-]."""
-        own = values[:, self.column.clamp(min=0)]
-        value = torch.where(self.column == CONSTANT, self.value, own)
-        return self._with_value(value[0] if len(value) == 1 else value)
-
-    @property
-    def generic(self) -> Self:
-        """The term with a different stress in place of each range; itself without ranges."""
-        values = torch.arange(1.0, self.n_ranges + 1).to(self.value)
-        return self.with_values(values[None]) if self.n_ranges else self
-
-    def _with_value(self, value: Tensor) -> Self:
-        twin = replace(self, value=value)
-        twin.__dict__.update({name: getattr(self, name) for name in self.independent})
-        return twin
+    def directions(self) -> Tensor | None:
+        """Directions that belong to the identity of the load; None for a pressure."""
+        return None
 
     def force(self, displacement: Tensor) -> Tensor:
         """Return the part of the internal force, minus the nodal forces, (B, N, D) [-]."""
@@ -176,39 +120,34 @@ class FollowerTerm:
     def work(self, displacement: Tensor) -> Tensor:
         """Return the work of `force` on the straight way from u = 0 to u, (B,) [-].
 
-        It is the potential of `force` if there is one, see `has_potential`.
+        It is the potential of `force` if there is one, see `Problem.has_potential`.
         """
         raise NotImplementedError
 
-    def stiffness(self, displacement: Tensor) -> Tensor:
-        """Return entries of the symmetric part of d force / du, (B, M) [-]."""
-        raise NotImplementedError
+    def stiffness(self, displacement: Tensor) -> list[Tensor]:
+        """Return entries of A = d force / du, (B, M) [-]: those of the symmetric and the skew part.
 
-    def places(self, pattern: Pattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the numbers of entries of `stiffness` and their positions in K, (P,) each.
-
-        A position is among the nnz stored values of K; nnz for entries that K does not store.
+        There is no skew part if A is symmetric for any supports.
         """
         raise NotImplementedError
 
-    def has_potential(self, free: Tensor, prescribed: Tensor) -> bool:
-        """Return True if d force / du is symmetric on the free degrees of freedom.
+    def maps(self, pattern: Pattern) -> list[csr_array]:
+        """Return the matrices (nnz, M) from entries of `stiffness` to entries of K."""
+        raise NotImplementedError
 
-        Args:
-            free: Mask of the free degrees of freedom, (N, D).
-            prescribed: Displacement of the others, (N, D) [-].
-        """
-        return True
+    def maps_on(self, pattern: Pattern) -> list[csr_array]:
+        """Return `maps`, computed once for the last pattern."""
+        if pattern not in self._maps:
+            self._maps.clear()
+            self._maps[pattern] = self.maps(pattern)
+        return self._maps[pattern]
 
-    def asymmetry(self, displacement: Tensor) -> Callable[[Tensor], Tensor] | None:
-        """Return the function v -> (A - A^T) v / 2 of A = d force / du at (1, N, D) [-].
-
-        It maps fields (1, N, D) to fields; None if A is symmetric for any supports.
-        """
-        return None
+    @cached_property
+    def _maps(self) -> dict[Pattern, list[csr_array]]:
+        return {}
 
     def describe(self) -> str:
-        """Return the term in words."""
+        """Return the part in words."""
         raise NotImplementedError
 
     def _sum_at_nodes(self, forces: Tensor, displacement: Tensor) -> Tensor:
@@ -221,12 +160,17 @@ class FollowerTerm:
 class FollowerLoads:
     """All follower loads of a body; False in a condition if there are none.
 
+    Forces, work and stiffness are linear in the stresses.
+
     Attributes:
-        terms: One for each kind of load.
+        parts: One for each load.
+        values: Stress over E of each load, (1, P) [-], or (B, P) for each member of a batch; NaN
+            for a range.
         ranges: Smallest and largest stress [Pa] of each load that differs between samples, by name.
     """
 
-    terms: tuple[FollowerTerm, ...] = ()
+    parts: tuple[LoadedPart, ...] = ()
+    values: Tensor = field(default_factory=lambda: torch.zeros(1, 0, dtype=torch.float64))
     ranges: Mapping[str, ParameterRange] = field(default_factory=dict)
 
     @classmethod
@@ -238,96 +182,131 @@ class FollowerLoads:
         material: Material,
         origin: Origin,
     ) -> Self:
-        """Return loads on a body; arguments as in `FollowerLoad.on`.
-
-        Raises:
-            ValueError: A load does not fit the body, or two ranges have one name.
-        """
+        """Return loads on a body; arguments as in `FollowerLoad.on`."""
         ranges: dict[str, ParameterRange] = {}
-        terms: dict[type[FollowerTerm], list[FollowerTerm]] = {}
+        values, parts = [], []
         for load in loads:
             name = load.parameter
             try:
                 ends = load.range
                 if ends and name in (*ranges, *material.parameter_ranges):
                     raise ValueError(f"two ranges have the name {name}; set another")
-                column = len(ranges) if ends else CONSTANT
-                term = load.on(basis, units, material, origin, column)
+                values.append(load.dimensionless(units))
+                parts.append(load.on(basis, units, material, origin))
             except ValueError as error:
                 raise ValueError(f"follower_loads.{name}: {error}") from error
             if ends:
                 ranges[name] = ends
-            terms.setdefault(type(term), []).append(term)
-        return cls(tuple(kind.join(own) for kind, own in terms.items()), ranges)
+        return cls(tuple(parts), torch.tensor([values], dtype=torch.float64), ranges)
 
     def __bool__(self) -> bool:
         """Return True if there is a load."""
-        return bool(self.terms)
+        return bool(self.parts)
 
     @property
     def kinds(self) -> str:
         """Kinds of the loads in words."""
-        return " and ".join(term.kind for term in self.terms)
-
-    @property
-    def n_members(self) -> int:
-        """B, the number of members of a batch that have their own stresses; else 1."""
-        return max((len(torch.atleast_2d(term.value)) for term in self.terms), default=1)
+        return " and ".join(dict.fromkeys(part.kind for part in self.parts))
 
     def to(self, device: torch.device | str) -> Self:
         """Return the loads with their tensors on a device."""
-        return replace(self, terms=tuple(term.to(device) for term in self.terms))
+        parts = tuple(part.to(device) for part in self.parts)
+        return replace(self, parts=parts, values=self.values.to(device))
 
     def identity(self) -> dict[str, Any]:
         """Return everything that decides their forces as plain data; {} without loads.
 
-        The key of the ranges of all kinds is `pressure_ranges`.
+        Facets or cells, stresses and numbers of the ranges are listed by kind. The key of the
+        ranges of all kinds is `pressure_ranges`.
         """
-        terms = {term.key: term.identity() for term in self.terms}
-        return terms | ({"pressure_ranges": self.ranges} if self.ranges else {})
+        columns = torch.where(self._ranged, self._ranged.cumsum(0) - 1, -1)
+        found: dict[str, Any] = {}
+        for key in dict.fromkeys(part.key for part in self.parts):
+            own = [k for k, part in enumerate(self.parts) if part.key == key]
+            sizes = torch.tensor([len(self.parts[k].nodes) for k in own])
+            nodes = torch.cat([self.parts[k].nodes for k in own]).sort(dim=1).values
+            stresses = self.values[0].nan_to_num()[own].repeat_interleave(sizes)
+            numbers = columns[own].repeat_interleave(sizes)
+            directions = [d for k in own if (d := self.parts[k].directions) is not None]
+            found[key] = [plain(nodes), plain(stresses)]
+            found[key] += [plain(numbers)] if (numbers >= 0).any() else []
+            found[key] += [plain(torch.cat(directions))] if directions else []
+        return found | ({"pressure_ranges": self.ranges} if self.ranges else {})
+
+    @property
+    def _ranged(self) -> Tensor:
+        """Mask of the loads with a range, (P,)."""
+        return self.values[0].isnan()
 
     def scaled(self, factor: float) -> Self:
         """Return the loads times a factor, without ranges."""
-        return type(self)(tuple(term.scaled(factor) for term in self.terms))
+        return type(self)(self.parts, factor * self.values)
 
     def with_values(self, values: Tensor) -> Self:
-        """Return the loads with stresses over E in place of the ranges, (1, P) or (B, P) [-]."""
-        return type(self)(tuple(term.with_values(values) for term in self.terms))
+        """Return the loads with stresses over E in place of the ranges, (1, R) or (B, R) [-]."""
+        every = self.values.expand(len(values), -1)
+        return type(self)(self.parts, every.index_copy(1, self._ranged.nonzero()[:, 0], values))
+
+    @property
+    def constant(self) -> Self:
+        """The loads with 0 in place of each range."""
+        return type(self)(self.parts, self.values.nan_to_num())
+
+    @property
+    def generic(self) -> Self:
+        """The loads with a different stress in place of each range."""
+        count = int(self._ranged.sum())
+        return self.with_values(torch.arange(1.0, count + 1)[None].to(self.values))
 
     def force(self, displacement: Tensor) -> Tensor:
         """Return the part of the internal force, minus the nodal forces, (B, N, D) [-]."""
-        return sum((t.force(displacement) for t in self.terms), torch.zeros_like(displacement))
+        forces = (part.force(displacement) for part in self.parts)
+        return self._weighted(forces, torch.zeros_like(displacement))
 
     def work(self, displacement: Tensor) -> Tensor:
         """Return the work of `force` on the straight way from u = 0 to u, (B,) [-]."""
-        nothing = displacement.new_zeros(len(displacement))
-        return sum((t.work(displacement) for t in self.terms), nothing)
+        works = (part.work(displacement) for part in self.parts)
+        return self._weighted(works, displacement.new_zeros(len(displacement)))
 
-    def has_potential(self, free: Tensor, prescribed: Tensor) -> bool:
-        """Return True if `work` is a potential of `force`, see `FollowerTerm.has_potential`."""
-        return all(term.generic.has_potential(free, prescribed) for term in self.terms)
+    def unit_forces(self, displacement: Tensor) -> Tensor:
+        """Return `force` at (1, N, D) of each load with a range at a stress of E, (R, N, D) [-]."""
+        pairs = zip(self.parts, self._ranged, strict=True)
+        forces = [part.force(displacement) for part, ranged in pairs if ranged]
+        return torch.cat(forces) if forces else displacement[:0]
 
-    def asymmetry(self, displacement: Tensor) -> Callable[[Tensor], Tensor]:
-        """Return the sum of `FollowerTerm.asymmetry` at (1, N, D) [-]."""
-        found = [term.asymmetry(displacement) for term in self.terms]
-        products = [product for product in found if product is not None]
-        return lambda v: sum((product(v) for product in products), torch.zeros_like(v))
+    def _weighted(self, terms: Iterable[Tensor], total: Tensor) -> Tensor:
+        """Return a total plus the terms of all loads for a stress of E, times their stresses."""
+        for value, term in zip(self.values.unbind(1), terms, strict=True):
+            total = total + value.reshape(-1, *(1,) * (term.ndim - 1)) * term
+        return total
 
-    def places(self, pattern: Pattern, device: torch.device) -> Places:
-        """Return `FollowerTerm.places` of each term, without entries that are not stored."""
-        places = []
-        for term in self.terms:
-            source, target = map(torch.from_numpy, term.places(pattern))
-            stored = target < len(pattern.indices)
-            places.append((source[stored].to(device), target[stored].to(device)))
-        return places
+    def stiffness(self, displacement: Tensor, pattern: Pattern) -> tuple[Tensor, Tensor | None]:
+        """Return the symmetric and the skew part of d force / du on the pattern, (B, nnz) each.
 
-    def add_stiffness(self, tangent: Tensor, displacement: Tensor, places: Places) -> Tensor:
-        """Return a tangent (B, nnz) plus the symmetric part of d force / du at `places`."""
-        for term, (source, target) in zip(self.terms, places, strict=True):
-            values = term.stiffness(displacement)[:, source]
-            tangent = tangent.scatter_add(1, target.expand(len(tangent), -1), values)
-        return tangent
+        The skew part is None where it is zero to rounding: then the matrix is symmetric.
+        """
+        symmetric, skew = np.zeros((2, len(displacement), len(pattern.indices)))
+        largest = 0.0
+        for value, part in zip(self.values.detach().cpu().numpy().T, self.parts, strict=True):
+            parts = zip(
+                (symmetric, skew), part.stiffness(displacement), part.maps_on(pattern), strict=False
+            )
+            for total, entries, matrix in parts:
+                scaled = value[:, None] * entries.detach().cpu().numpy()
+                total += (matrix @ scaled.T).T
+                largest = max(largest, np.abs(scaled).max())
+        found = [torch.from_numpy(part).to(displacement.device) for part in (symmetric, skew)]
+        is_symmetric = np.abs(skew).max(initial=0.0) <= ASYMMETRIC * largest
+        return found[0], None if is_symmetric else found[1]
+
+
+def entry_map(pattern: Pattern, target: Any, source: Any, factor: Any) -> csr_array:
+    """Return the matrix (nnz, M) that adds `factor` times entry `source` to K at `target`.
+
+    Arguments are arrays of one shape. Targets that K does not store are omitted.
+    """
+    stored, shape = target < len(pattern.indices), (len(pattern.indices), source.max() + 1)
+    return csr_array((factor[stored], (target[stored], source[stored])), shape=shape)
 
 
 NO_LOADS = FollowerLoads()

@@ -1,6 +1,5 @@
 """Follower pressure: a force along the current normal on the current area of a boundary part."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
@@ -9,10 +8,11 @@ import numpy as np
 import skfem
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.assembly.elements import QUADRATIC
-from dpl.fem.assembly.follower_loads import CONSTANT, FollowerLoad, FollowerTerm, Stress
+from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Stress, entry_map
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin, Region, facets_in
@@ -42,32 +42,22 @@ class FollowerPressure(FollowerLoad):
     value: Stress
     name: str | None = None
 
-    def check(self, mesh: skfem.Mesh, units: Units) -> None:
-        """See `FollowerLoad.check`."""
-        self.dimensionless(units)
-        facets_in(self.region, mesh)
-
     def on(
         self,
         basis: skfem.Basis,
         units: Units,
         material: Material,
         origin: Origin = 0.0,
-        column: int = CONSTANT,
     ) -> "PressureSurface":
-        """Return the loaded surface, see `FollowerLoad.on`.
-
-        Raises:
-            ValueError: The region contains no boundary facet, or `value` is invalid.
-        """
-        pressure = self.dimensionless(units)
-        facets = facets_in(self.region, basis.mesh, units.length, origin)
-        return PressureSurface.build(basis, facets, pressure, column)
+        """Return the loaded surface, see `FollowerLoad.on`."""
+        return PressureSurface.build(
+            basis, facets_in(self.region, basis.mesh, units.length, origin)
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class PressureSurface(FollowerTerm):
-    """Boundary facets under a follower pressure. `value` is p / E.
+class PressureSurface(LoadedPart):
+    """Boundary facets under the follower pressure p = E.
 
     The area vector of a deformed facet is y1 x y2, with the derivatives y_i = t_i + du/dxi_i of the
     positions along the coordinates xi_i of the reference facet. It is a polynomial of the nodal
@@ -87,20 +77,13 @@ class PressureSurface(FollowerTerm):
 
     kind: ClassVar[str] = "follower pressure"
     key: ClassVar[str] = "pressure"
-    independent: ClassVar[tuple[str, ...]] = ("_pair_weights",)
     weights: Tensor
     slopes: Tensor
     tangents: Tensor
 
     @classmethod
-    def build(
-        cls,
-        basis: skfem.Basis,
-        facets: NDArray[np.int_],
-        pressure: float,
-        column: int = CONSTANT,
-    ) -> Self:
-        """Return the surface of boundary facets (S,) under one pressure [-], see the attributes."""
+    def build(cls, basis: skfem.Basis, facets: NDArray[np.int_]) -> Self:
+        """Return the surface of boundary facets (S,)."""
         mesh = basis.mesh
         cells = mesh.f2t[0, facets]
         side = (mesh.t2f[:, cells] == facets).argmax(axis=0)  # number of the facet in its cell
@@ -120,27 +103,20 @@ class PressureSurface(FollowerTerm):
             weights=torch.from_numpy(np.ascontiguousarray(weights)),
             slopes=torch.from_numpy(np.ascontiguousarray(slopes)),
             tangents=torch.from_numpy(tangents),
-            value=torch.full((len(facets),), pressure, dtype=torch.float64),
-            column=torch.full((len(facets),), column),
         )
 
     def describe(self) -> str:
-        """See `FollowerTerm.describe`."""
         return f"follower pressure on {len(self.nodes):,} facets"
 
     def force(self, displacement: Tensor) -> Tensor:
-        """Return p dV/du, minus the nodal forces of the pressure, (B, N, D) [-].
-
-        It is a part of the internal force of a body, since it depends on the displacement.
-        """
+        """Return dV/du, minus the nodal forces of the pressure, (B, N, D) [-]."""
         first, second = self._images(self._slopes(displacement))
         return self._sum_of_normals(torch.linalg.cross(first, second), displacement)
 
     def work(self, displacement: Tensor) -> Tensor:
-        """Return the work against the pressure on the straight way from u = 0 to u, (B,) [-].
+        """Return the volume between the surface at rest and the deformed one, (B,) [-].
 
-        It is p times the volume between the surface at rest and the deformed one, and the potential
-        of `force` if there is one, see `has_potential`.
+        There is a potential if the surface is closed, or if its edge is fixed or remains in planes.
         """
         slopes = self._slopes(displacement)
         (t1, t2), (h1, h2) = self.tangents.unbind(-1), slopes.unbind(-1)
@@ -149,50 +125,18 @@ class PressureSurface(FollowerTerm):
         normal = cross(t1, t2) + (cross(t1, h2) + cross(h1, t2)) / 2 + cross(h1, h2) / 3
         return (self._sum_of_normals(normal, displacement) * displacement).sum((-2, -1))
 
-    def asymmetry(self, displacement: Tensor) -> Callable[[Tensor], Tensor]:
-        """Return the function v -> (A - A^T) v / 2 of the load stiffness A at (1, N, D) [-].
+    def stiffness(self, displacement: Tensor) -> list[Tensor]:
+        """Return entries of the load stiffness, (B, S A (A + 1)/2 3) [-] each.
 
-        It maps fields (1, N, D) to fields. The matrix is that of the edge of the surface: the parts
-        of neighbouring facets cancel.
+        The block of the nodes a <= b (b slowest) is the cross product with one vector: its entries
+        (i, k) are epsilon_ikl times the component l. In the symmetric part, blocks of a node with
+        itself are zero. In the skew part the blocks of neighbouring facets cancel, so that only the
+        edge of the surface is left.
         """
-        vectors = self._pair_vectors(displacement)  # (1, S, A, A, 3)
-        vectors = (vectors + vectors.transpose(2, 3)) / 2
-
-        def product(field: Tensor) -> Tensor:
-            at_facets = torch.nn.functional.pad(field[:, self.nodes], (0, 3 - field.shape[-1]))
-            forces = torch.linalg.cross(at_facets[:, :, None].expand_as(vectors), vectors).sum(3)
-            return self._sum_at_nodes(forces[..., : field.shape[-1]], field)
-
-        return product
-
-    def has_potential(self, free: Tensor, prescribed: Tensor) -> bool:
-        """Return True if the load stiffness is symmetric on the free degrees of freedom.
-
-        This is so if the surface is closed, or if its edge is fixed or remains in planes. The
-        stiffness is linear in u, so that one random displacement decides.
-
-        Args:
-            free: Mask of the free degrees of freedom, (N, D).
-            prescribed: Displacement of the others, (N, D) [-].
-        """
-        random = torch.Generator().manual_seed(0)
-        noise = torch.rand(2, 1, *free.shape, generator=random, dtype=torch.float64) - 0.5
-        u, v = torch.where(free, noise.to(free.device), 0.0)
-        u = 0.1 * u + 0.7 * prescribed
-        product = torch.func.jvp(self.force, (u,), (v,))[1][:, free]
-        return bool(self.asymmetry(u)(v)[:, free].norm() <= 1e-10 * product.norm())
-
-    def stiffness(self, displacement: Tensor) -> Tensor:
-        """Return the symmetric part of the load stiffness, (B, 2 S A (A - 1)/2 3) [-].
-
-        The block of the nodes a < b (b slowest) is the cross product with one vector: its entries
-        (i, k) are epsilon_ikl times the component l. Blocks of a node with itself are zero. The
-        vectors come first, then the same with the opposite sign.
-        """
-        b, a = np.tril_indices(self.nodes.shape[1], -1)
+        b, a = np.tril_indices(self.nodes.shape[1])
         vectors = self._pair_vectors(displacement)
-        entries = ((vectors[:, :, a, b] - vectors[:, :, b, a]) / 2).flatten(1)
-        return torch.cat([entries, -entries], dim=1)
+        here, there = vectors[:, :, a, b] / 2, vectors[:, :, b, a] / 2
+        return [(here - there).flatten(1), (here + there).flatten(1)]
 
     def _pair_vectors(self, displacement: Tensor) -> Tensor:
         """Return vectors c of all pairs of nodes, (B, S, A, A, 3) [-].
@@ -201,7 +145,7 @@ class PressureSurface(FollowerTerm):
         """
         y1, y2 = self._images(self._slopes(displacement))  # (B, S, Q, 3)
         first, second = self._pair_weights
-        vectors = (first @ y2 - second @ y1) * self.value[..., None, None]
+        vectors = first @ y2 - second @ y1
         return vectors.unflatten(2, (self.nodes.shape[1], -1))
 
     @cached_property
@@ -211,17 +155,22 @@ class PressureSurface(FollowerTerm):
         first, second = (weights * slopes[:, :, None]).flatten(2, 3)
         return first, second
 
-    def places(self, pattern: Pattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """See `FollowerTerm.places`."""
+    def maps(self, pattern: Pattern) -> list[csr_array]:
+        """Return the maps of both parts; K stores the upper triangle."""
         nodes = self.nodes.cpu().numpy()
-        b, a = np.tril_indices(nodes.shape[1], -1)
+        b, a = np.tril_indices(nodes.shape[1])
         missing = 3 - pattern.number.shape[1]
         numbers = np.pad(pattern.number, ((0, 0), (0, missing)), constant_values=-1)
         rows, columns = numbers[nodes[:, a]], numbers[nodes[:, b]]  # (S, pairs, 3)
         i, k = np.array([1, 2, 0]), np.array([2, 0, 1])  # epsilon_ikl = 1 for l = 0, 1, 2
-        both = [(rows[..., i], columns[..., k]), (rows[..., k], columns[..., i])]
-        target = np.stack([pattern.positions(*pair) for pair in both]).flatten()
-        return np.arange(target.size), target
+        first = np.stack([rows[..., i], rows[..., k]])
+        second = np.stack([columns[..., k], columns[..., i]])
+        source = np.broadcast_to(np.arange(first[0].size).reshape(first[0].shape), first.shape)
+        target = pattern.positions(first, second)
+        sign = np.array([1.0, -1.0])[:, None, None, None] * np.ones(first.shape)
+        # the two halves of the block of a node with itself fall on the same entries
+        skew_sign = np.where(first < second, sign, -sign) * np.where(a == b, 0.5, 1.0)[:, None]
+        return [entry_map(pattern, target, source, factor) for factor in (sign, skew_sign)]
 
     def _slopes(self, displacement: Tensor) -> Tensor:
         """Return du/dxi_i at the quadrature points, (B, S, Q, 3, 2) [-]; in 2D with zeros."""
@@ -236,9 +185,9 @@ class PressureSurface(FollowerTerm):
         return first, second
 
     def _sum_of_normals(self, normal: Tensor, displacement: Tensor) -> Tensor:
-        """Return the nodal forces (B, N, D) of p times normals (B, S, Q, 3)."""
+        """Return the nodal forces (B, N, D) of normals (B, S, Q, 3)."""
         forces = self.weights.mT @ normal[..., : displacement.shape[-1]]
-        return self._sum_at_nodes(forces * self.value[..., None, None], displacement)
+        return self._sum_at_nodes(forces, displacement)
 
 
 def _corners(basis: skfem.Basis, local: int) -> NDArray[np.float64]:

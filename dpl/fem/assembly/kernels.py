@@ -9,10 +9,12 @@ from collections.abc import Iterator, Sequence
 from functools import cache
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.numba_laws import Law, required_terms
@@ -27,7 +29,7 @@ NO_VALUES = np.zeros(0)
 
 
 class Kernels:
-    """Compiled internal force and tangent of one body; see `dpl.fem.assembly.element_loops`."""
+    """Compiled loops over cells of one law, see `dpl.fem.assembly.element_loops`."""
 
     def __init__(
         self,
@@ -54,23 +56,24 @@ class Kernels:
         self.dV = dV
         self.places = _in_blocks(places)
         self.functions = None if functions is None else np.ascontiguousarray(functions)
-        form = form_of(material)
-        self._law = (
-            Law.of(form, element_loops.SOURCES),
-            max(required_terms(form), int(functions is not None and material.finite)),
-            float(material.finite),
-        )
-        self._set_constants(material)
+        self._law: Any = None
+        self._set_law(material)
 
-    def _set_constants(self, material: Material) -> None:
+    def _set_law(self, material: Material) -> None:
+        form = form_of(material)
+        law = Law.of(form, element_loops.SOURCES)
+        if self._law is None or self._law[0] != law:
+            volumetric = self.functions is not None and material.finite
+            needs = max(required_terms(form), int(volumetric))
+            self._law = law, needs, float(material.finite)
         self._constants = as_columns(material.constants)
         self._frames = frames_of(material)
         self._bulk = None if self.functions is None else as_columns([material.point_bulk])
 
-    def with_moduli(self, materials: Sequence[Material]) -> "Kernels":
-        """Return the kernels of the same body with other moduli of its one law."""
+    def with_law(self, material: Material) -> "Kernels":
+        """Return the loops of another law over the same cells."""
         other = copy.copy(self)
-        other._set_constants(*materials)
+        other._set_law(material)
         return other
 
     def force(self, u: Array, out: Array, member: int = 0) -> float:
@@ -105,46 +108,57 @@ class Kernels:
         law_arguments = law, moduli, self._frames, needs, finite
         return 1 + call_compiled(system, *law_arguments, u, _both(gap), *body, out, values)
 
-    def update_strain_gap(
-        self, gap: Gap | None, length: float, update: Array, u: Array | None = None
-    ) -> Gap:
-        """Return the gaps of the mixed integration points after a step to u."""
+    def gap_after(self, gap: Gap | None, length: float, update: Array, u: Array) -> Gap:
+        """Return the gaps of the mixed integration points after a step (N, D) to u (N, D)."""
         kernel, body = element_loops.update_gap, (self.cells, self.dN, self.dV, self.functions)
-        u = np.zeros_like(update) if u is None else u
         both = call_compiled(kernel, self._law[0], _both(gap), length, update, u, *body)
         found: Gap = both[0] if self.functions is None else both
         return found
 
 
-class GroupedKernels:
-    """Kernels of a body of several laws: one for the cells of each class of law."""
+class CompiledLoops(NamedTuple):
+    """Compiled loops over the cells of a body, with the interface of `TensorAssembly`.
 
-    def __init__(self, groups: Sequence[Kernels]) -> None:
-        """Take the kernels of the groups."""
-        self._groups = groups
+    Attributes:
+        groups: One for the cells of each class of law.
+        n_entries: nnz, the number of stored entries of the tangent.
+    """
 
-    def with_moduli(self, materials: Sequence[Material]) -> "GroupedKernels":
-        """Return the kernels of the same body with other moduli of the same laws."""
-        pairs = zip(self._groups, materials, strict=True)
-        return GroupedKernels([kernels.with_moduli([material]) for kernels, material in pairs])
+    groups: Sequence[Kernels]
+    n_entries: int
 
-    def force(self, u: Array, out: Array, member: int = 0) -> float:
-        """Add the internal force, see `Kernels.force`."""
-        return min(kernels.force(u, out, member) for kernels in self._groups)
+    def evaluate(self, displacement: Tensor) -> tuple[Tensor, Tensor]:
+        """Return internal force (B, N, D) and min det F (B,) [-]."""
+        displacement = displacement.detach().contiguous()
+        internal = torch.zeros(displacement.shape, dtype=torch.float64)
+        pairs = enumerate(zip(displacement.numpy(), internal.numpy(), strict=True))
+        lowest = [min(group.force(u, out, k) for group in self.groups) for k, (u, out) in pairs]
+        return internal, torch.tensor(lowest, dtype=torch.float64)
 
-    def system(self, u: Array, gap: Sequence[Gap] | None, out: Array, values: Array) -> float:
-        """Add force and tangent, see `Kernels.system`."""
-        gaps = [None] * len(self._groups) if gap is None else gap
-        pairs = zip(self._groups, gaps, strict=True)
-        return min(kernels.system(u, own, out, values) for kernels, own in pairs)
+    def linearise(
+        self, displacement: Tensor, gap: Sequence[Gap] | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return force (1, N, D), tangent (1, nnz) and min det C of the mixed points (1,)."""
+        u = displacement[0].detach().contiguous().numpy()
+        force, values = np.zeros(u.shape), np.zeros(self.n_entries + 1)
+        lowest = min(group.system(u, own, force, values) for group, own in self._with_gaps(gap))
+        tangent = torch.from_numpy(values[:-1])[None]
+        return torch.from_numpy(force)[None], tangent, torch.tensor([lowest])
 
     def update_strain_gap(
-        self, gap: Sequence[Gap] | None, length: float, update: Array, u: Array | None = None
+        self,
+        gap: Sequence[Gap] | None,
+        length: float,
+        update: Tensor,
+        displacement: Tensor | None = None,
     ) -> list[Gap]:
-        """Return the strain gap of each group, see `Kernels.update_strain_gap`."""
-        gaps = [None] * len(self._groups) if gap is None else gap
-        pairs = zip(self._groups, gaps, strict=True)
-        return [kernels.update_strain_gap(own, length, update, u) for kernels, own in pairs]
+        """Return the gap of each group after a step, see `Problem.update_strain_gap`."""
+        step = update[0].contiguous().numpy()
+        u = np.zeros_like(step) if displacement is None else displacement[0].contiguous().numpy()
+        return [group.gap_after(own, length, step, u) for group, own in self._with_gaps(gap)]
+
+    def _with_gaps(self, gap: Sequence[Gap] | None) -> Iterator[tuple[Kernels, Gap | None]]:
+        return zip(self.groups, [None] * len(self.groups) if gap is None else gap, strict=True)
 
 
 def _both(gap: Gap | None) -> tuple[Array, Array]:

@@ -28,6 +28,10 @@ from dpl.fem.materials.tensors import (
     volume_change,
 )
 
+# dP/dF at the points without the volumetric stiffness (B, E, Q, 3, 3, 3, 3), dJ/dF (B, E, Q, 3, 3),
+# and the volumetric stiffness between the coefficients of dJ/dF (B, E, M, M) [-]
+Tangent = tuple[Tensor, Tensor, Tensor]
+
 
 class CellVolumes(NamedTuple):
     """Polynomials of the volume change in the cells of a body.
@@ -85,20 +89,6 @@ class MixedGap(NamedTuple):
     volume: Tensor
 
 
-class PointTangent(NamedTuple):
-    """Parts of the tangent of a body with mean dilatation.
-
-    Attributes:
-        moduli: dP/dF at the points, without the volumetric stiffness (B, E, Q, 3, 3, 3, 3) [-].
-        slope: dJ/dF, (B, E, Q, 3, 3) [-].
-        stiffness: Volumetric stiffness between the coefficients of the slope, (B, E, M, M) [-].
-    """
-
-    moduli: Tensor
-    slope: Tensor
-    stiffness: Tensor
-
-
 def change_of_volume(material: Material, H: Tensor) -> Tensor:
     """Return J - 1, for a law of small strains tr H, (B, E, Q) [-]."""
     return volume_change(H) if material.finite else trace(H)
@@ -118,8 +108,8 @@ def stress(material: Material, H: Tensor, volumes: CellVolumes) -> Tensor:
     return material.stress(H) + p[..., None, None] * _slope(material, H)
 
 
-def tangent(material: Material, H: Tensor, volumes: CellVolumes) -> PointTangent:
-    """Return the parts of the tangent at H (B, E, Q, 3, 3)."""
+def tangent(material: Material, H: Tensor, volumes: CellVolumes) -> Tangent:
+    """Return the parts of the tangent at H (B, E, Q, 3, 3), see `Tangent`."""
     j = change_of_volume(material, H)
     own, own_modulus = _pressure_and_modulus(material, j)
     mean, mean_modulus = _pressure_and_modulus(material, volumes.project(j))
@@ -129,12 +119,12 @@ def tangent(material: Material, H: Tensor, volumes: CellVolumes) -> PointTangent
         minors = dyad(slope, slope)
         curvature = (minors - minors.transpose(-3, -1)) / _at_moduli(1 + j)  # d2J/dF2
         A = A + _at_moduli(volumes.project(mean) - own) * curvature
-    return PointTangent(A, slope, volumes.matrices(mean_modulus))
+    return A, slope, volumes.matrices(mean_modulus)
 
 
 def mixed_system(
     material: Material, H: Tensor, gap: MixedGap, volumes: CellVolumes
-) -> tuple[Tensor, PointTangent]:
+) -> tuple[Tensor, Tangent]:
     """Return the stress conjugate to H and the tangent with mixed integration points.
 
     Each cell eliminates the coefficients of a volume change and of a pressure, each point a strain,
@@ -154,9 +144,8 @@ def mixed_system(
     at_points = Response(
         law.stress + p[..., None, None] * unit.stress, law.moduli + _at_moduli(p) * unit.moduli
     )
-    return S + H @ S, PointTangent(
-        at_points.tangent(H), _slope(material, H), volumes.matrices(modulus)
-    )
+    tangent = at_points.tangent(H), _slope(material, H), volumes.matrices(modulus)
+    return S + H @ S, tangent
 
 
 def volume_gap(H: Tensor, update: Tensor, volumes: CellVolumes) -> Tensor:

@@ -8,7 +8,7 @@ and 2.
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -21,16 +21,7 @@ NEAR = 0.1  # squared distance, over that of the farthest sample, at which weigh
 SINGULAR = 1e-4  # smallest variance of samples along a direction, over their squared distance
 
 
-class Samples(NamedTuple):
-    """Points at which values are known.
-
-    Attributes:
-        points: Positions, (S, D).
-        volumes: Volumes, (S,).
-    """
-
-    points: Array
-    volumes: Array
+Samples = tuple[Array, Array]  # positions (S, D) and volumes (S,) of points with known values
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +62,7 @@ class Recovery:
             degree: Degree of the displacement, 1 or 2.
         """
         count, quadrature = dV.shape
-        all_points = Samples(at.reshape(-1, at.shape[-1]), dV.ravel())
+        all_points = at.reshape(-1, at.shape[-1]), dV.ravel()
         own = np.repeat(np.arange(count), cells.shape[1])
         adjacent = _pattern(cells.ravel(), own, (len(points), count))
         cell = np.repeat(np.arange(count), quadrature)
@@ -81,7 +72,7 @@ class Recovery:
         patches = _patches(adjacent, boundary)
         volumes = dV.sum(axis=1)
         shares = dV / volumes[:, None]
-        centres = Samples((at * shares[..., None]).sum(axis=1), volumes)
+        centres = (at * shares[..., None]).sum(axis=1), volumes
         matrix, determined = _fit(centres, patches, points)
         matrix = matrix @ csr_array((shares.ravel(), members.indices, members.indptr))
         if quadrature > 1 and not determined.all():
@@ -134,10 +125,11 @@ def _fit(
     """
     first, column = patches.indptr[:-1], patches.indices
     row = np.repeat(np.arange(len(points)), np.diff(patches.indptr))
-    offset = samples.points[column] - points[row]
+    at, volumes = samples
+    offset = at[column] - points[row]
     square = (offset**2).sum(axis=1)
     farthest = np.maximum.reduceat(square, first)
-    weight = samples.volumes[column] / (square / farthest[row] + NEAR)
+    weight = volumes[column] / (square / farthest[row] + NEAR)
     weight /= np.add.reduceat(weight, first)[row]
     mean = np.add.reduceat(weight[:, None] * offset, first)
     offset -= mean[row]

@@ -33,7 +33,7 @@ def make_backend(
         pattern: Structure of the matrices.
         name: "band", "band32", "pardiso", "superlu", "cg", "auto", see `select_backend`, or a
             function of `pattern` and `near_null` that returns a backend.
-        near_null: Rigid body modes, (n, k), see `TensorAssembly.near_null`; "cg" needs them for
+        near_null: Rigid body modes, (n, k), see `Problem.near_null`; "cg" needs them for
             multigrid.
 
     Raises:

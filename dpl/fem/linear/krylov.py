@@ -238,7 +238,7 @@ class CG:
 
     Attributes:
         pattern: Structure of the matrices.
-        near_null: Rigid body modes, (n, k), see `TensorAssembly.near_null`.
+        near_null: Rigid body modes, (n, k), see `Problem.near_null`.
     """
 
     pattern: Pattern

@@ -61,7 +61,7 @@ class FacePressure(SurfaceLoads, CombinedLoads):
     @cached_property
     def shapes(self) -> Tensor:
         """Force of the pressure 1 on the undeformed surface, (1, N, D) [-]."""
-        surface = PressureSurface.build(self.problem.basis, self.facets, 1.0)
+        surface = PressureSurface.build(self.problem.basis, self.facets)
         force = -surface.force(torch.zeros(1, *self.problem.shape, dtype=torch.float64))
         return torch.where(force.abs() > ROUNDOFF * force.abs().max(), force, 0.0)
 

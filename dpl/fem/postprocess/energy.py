@@ -99,7 +99,7 @@ class RestStiffness:
         """Return the strain energy at rest W(0), (1,) or (B,) [-]; it is not zero for every law."""
         if not parameters.shape[-1]:
             return self._energy
-        body = self.problem.with_parameters(parameters).without_follower_loads
+        body = self.problem.with_parameters(parameters)
         nothing = body.points.new_zeros(1, len(body.cells), 1, 3, 3)
         volumes = body.dV.sum(1).expand(len(body.cells))
         return (body.material.energy(nothing)[..., 0] * volumes).sum(1).expand(len(parameters))

@@ -36,7 +36,7 @@ def fields(problem: Problem, displacement: Tensor) -> Fields:
 
 def deformation_gradient(problem: Problem, displacement: Tensor) -> Tensor:
     """Return F = I + du/dX at the quadrature points, (B, E, Q, 3, 3) [-]."""
-    H = problem.gradient(displacement)
+    H = problem.discretisation.gradient(displacement)
     return H + torch.eye(3, dtype=H.dtype, device=H.device)
 
 

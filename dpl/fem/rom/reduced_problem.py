@@ -164,7 +164,7 @@ class ReducedProblem:
     def update_strain_gap(self, state: ReducedState, new: ReducedState) -> ReducedState:
         """Return the state after a step with the strain gap of its mixed integration points."""
         problem = self.cells.problem
-        if not problem.supports_mip:
+        if not problem.material.has_response:
             return new
         update = (new.cell_displacement - state.cell_displacement) / new.length
         u = new.cell_displacement

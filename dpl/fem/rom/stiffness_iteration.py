@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
@@ -135,7 +135,7 @@ def node_body(terms: StiffnessTerms, iteration: StiffnessIteration) -> Problem:
     if not iteration.varies:
         return body
     node = torch.tensor(iteration.node, dtype=torch.float64)
-    return body.with_material(terms.body(node).material)
+    return replace(body, material=terms.body(node).material)
 
 
 def _entries(matrix: csr_array, structure: csr_array) -> Array:

@@ -1,18 +1,21 @@
 """Equilibrium as a differentiable function of load and parameters, by one adjoint solve each."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dpl.fem.linear.gmres import Map, gmres
-from dpl.fem.linear.interface import Array, SymmetricProduct
+from dpl.fem.linear.interface import Array
+from dpl.fem.linear.unsymmetric import solve_unsymmetric
 from dpl.fem.problem import System
-from dpl.fem.solvers.factor_reuse import MAX_GMRES
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load, Solution, Status
+
+Map = Callable[[Array], Array]  # (n,) -> (n,)
 
 ADJOINT_TOL = 1e-12  # relative residual of an adjoint solve with an unsymmetric tangent [-]
 
@@ -83,16 +86,12 @@ class DifferentiableSolve:
 
     def _adjoint(self, system: System) -> Map:
         linear = self.newton.linear_solver
-        values, asymmetry = system.tangent[0].numpy(), system.asymmetry
+        values = system.tangent[0].numpy()
         factor = linear.tangent_backend.factorise(values)
-        if asymmetry is None:
+        if system.skew is None:
             return factor.solve
-        product = SymmetricProduct(linear.problem.pattern, values)
-
-        def transposed(x: Array) -> Array:
-            return product(x) - asymmetry(x)
-
-        return lambda right: gmres(transposed, factor.apply, right, ADJOINT_TOL, MAX_GMRES)
+        transposed = linear.problem.pattern, values, -system.skew[0].numpy()
+        return partial(solve_unsymmetric, *transposed, factor.apply, rtol=ADJOINT_TOL)
 
 
 class _Equilibrium(torch.autograd.Function):

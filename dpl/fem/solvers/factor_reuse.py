@@ -5,7 +5,6 @@ from enum import Enum
 
 from torch import Tensor
 
-from dpl.fem.linear.gmres import Map, gmres
 from dpl.fem.linear.interface import (
     UNKNOWN,
     UNSTABLE,
@@ -19,6 +18,7 @@ from dpl.fem.linear.interface import (
     SymmetricProduct,
 )
 from dpl.fem.linear.krylov import conjugate_gradients, smallest_ritz_value
+from dpl.fem.linear.unsymmetric import solve_unsymmetric
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.linear import LinearSolver
@@ -26,8 +26,6 @@ from dpl.fem.solvers.linear import LinearSolver
 MIN_RITZ_VALUE = 0.05  # smallest eigenvalue of M^-1 K below which the tangent K is factorised
 MAX_CG_STALE = 8  # conjugate gradient steps with a stale factor before the tangent is factorised
 MAX_CG_COROTATED = 16  # the same with the corotated factor of K(0)
-
-MAX_GMRES = 60  # GMRES steps with the factor of the symmetric part of an unsymmetric tangent
 
 
 class Preconditioner(Enum):
@@ -86,7 +84,7 @@ class TangentSolver:
         *,
         near: bool,
         definite: bool = False,
-        asymmetry: Map | None = None,
+        skew: Array | None = None,
     ) -> Array:
         """Return K(u)^-1 of a right-hand side (n,), to a relative residual.
 
@@ -97,8 +95,8 @@ class TangentSolver:
             rtol: Relative residual at which conjugate gradients stop [-].
             near: Whether u is near enough to the last iterate to reuse its factor.
             definite: Refuse an indefinite tangent.
-            asymmetry: Function x -> (K - K^T) x / 2, (n,) to (n,); `tangent` is the symmetric part,
-                whose factor preconditions GMRES. None: K is symmetric.
+            skew: Entries of (K - K^T) / 2, (nnz,); `tangent` is then the symmetric part. None: K is
+                symmetric.
 
         Raises:
             SingularMatrix: The tangent has no factor, or is indefinite and refused.
@@ -119,8 +117,9 @@ class TangentSolver:
             self._last, self._tangent = kind, SymmetricProduct(self._pattern, tangent)
             apply, steps = self._factor.apply, MAX_CG_COROTATED if corotated else MAX_CG_STALE
             with suppress(SingularMatrix):
-                if asymmetry is not None:
-                    return gmres(_sum(self._tangent, asymmetry), apply, right, rtol, steps)
+                if skew is not None:
+                    values = tangent, skew
+                    return solve_unsymmetric(self._pattern, *values, apply, right, rtol, steps)
                 return conjugate_gradients(
                     self._tangent, apply, right, rtol, steps, abort_if_slow=corotated
                 )
@@ -134,9 +133,9 @@ class TangentSolver:
             self._factor = self.backend.factorise(tangent)
         if definite and self._factor.negative_pivots:
             raise SingularMatrix("the tangent is indefinite")
-        if asymmetry is not None:
-            whole = _sum(SymmetricProduct(self._pattern, tangent), asymmetry)
-            return gmres(whole, self._factor.apply, right, rtol, MAX_GMRES)
+        if skew is not None:
+            apply = self._factor.apply
+            return solve_unsymmetric(self._pattern, tangent, skew, apply, right, rtol)
         return self._factor.solve(right, rtol)
 
     def stability(self, u: Tensor) -> Stability:
@@ -167,11 +166,6 @@ class TangentSolver:
             value = smallest_ritz_value(self._tangent, self._factor.apply, self._pattern.size)
             return value < MIN_RITZ_VALUE
         return False
-
-
-def _sum(first: Map, second: Map) -> Map:
-    """Return the function x -> first(x) + second(x)."""
-    return lambda x: first(x) + second(x)
 
 
 def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> Stability:

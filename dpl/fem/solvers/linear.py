@@ -120,7 +120,7 @@ class LinearSolver:
 
         K(0) does not depend on them, and its factors are shared.
         """
-        return replace(self, problem=self.problem.with_prescribed(prescribed), parent=self)
+        return replace(self, problem=replace(self.problem, prescribed=prescribed), parent=self)
 
     def forget_clones(self) -> None:
         """Drop the solvers of other parameters, so that their factors are computed again."""

@@ -194,21 +194,19 @@ class Newton:
 
         It contains the step of the supports.
         """
-        problem, u = self.problem.with_follower_factor(factor), state.displacement
-        internal, tangent, asymmetry = self._internal(state, factor), None, None
+        problem, u = self.problem.under(factor), state.displacement
+        internal, tangent, skew = self._internal(state, factor), None, None
         if u.any():
             system = problem.linearise(u, state.gap)
             system = system if system.valid else problem.linearise(u)
             internal, tangent = system.force, system.tangent[0].numpy()
-            asymmetry = system.asymmetry
+            skew = None if system.skew is None else system.skew[0].numpy()
         right = factor * force - internal
         if state.support_step.any():
             right = right - problem.tangent_product(u, state.support_step)
         values = problem.restrict(right[0])
         definite = self.abandon_indefinite_guess and run.from_guess
-        step = run.tangents.solve(
-            tangent, u, values, rtol, near=near, definite=definite, asymmetry=asymmetry
-        )
+        step = run.tangents.solve(tangent, u, values, rtol, near=near, definite=definite, skew=skew)
         return problem.extend(step)[None] + state.support_step
 
     def _update(self, state: "_State", update: Tensor, *, halvings: int) -> "_State | None":
@@ -220,7 +218,7 @@ class Newton:
 
         bound = self.min_detF_ratio * min(float(state.volume_ratio), 1.0)
         new = longest_valid_step(state_after, bound, halvings=halvings)
-        if new is None or not (self.mixed_integration and self.problem.supports_mip):
+        if new is None or not (self.mixed_integration and self.problem.material.has_response):
             return new
         u = new.displacement
         gap = self.problem.update_strain_gap(state.gap, new.length, update, u)
@@ -241,7 +239,7 @@ class Newton:
     def _residual(self, state: "_State", force: Tensor, factor: float) -> float:
         """Return the relative residual under `factor` times a load, evaluated once."""
         if factor not in state.residuals:
-            body = self.problem.with_follower_factor(factor)
+            body = self.problem.under(factor)
             internal = self._internal(state, factor)
             state.residuals[factor] = float(body.relative_residual_of(internal, factor * force))
         return state.residuals[factor]
@@ -261,7 +259,7 @@ class Newton:
             return True
         if not 0.1 * state.previous < residual < 1e-4:  # the residual still falls
             return False
-        body, internal = self.problem.with_follower_factor(factor), self._internal(state, factor)
+        body, internal = self.problem.under(factor), self._internal(state, factor)
         return bool(body.is_equilibrium(state.displacement, internal, factor * force, tol))
 
     def _report(

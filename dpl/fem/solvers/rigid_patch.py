@@ -163,7 +163,7 @@ class RigidPatch:
     @cached_property
     def _held_linear(self) -> LinearSolver:
         """Linear solver of the body with the patch held at rest."""
-        body = self.problem.with_held(self.held)
+        body = replace(self.problem, free=self.problem.free & ~self.held)
         return LinearSolver(body, self.linear.tol, self.linear.linear)
 
     def wrench(self, force: Tensor, displacement: Tensor) -> Wrench:

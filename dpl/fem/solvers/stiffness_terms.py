@@ -9,6 +9,7 @@ import torch
 from scipy.linalg import qr
 from torch import Tensor
 
+from dpl.fem.assembly.follower_loads import NO_LOADS
 from dpl.fem.materials.linear_elastic import linear_law
 from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
@@ -69,8 +70,7 @@ class StiffnessTerms:
     def body(self, factors: Tensor) -> Problem:
         """Return the linear elastic body of factors (T,), without foundation and follower loads."""
         law = linear_law(self.problem.reference.material, factors @ self.vectors)
-        body = self.problem.without_follower_loads.with_material(law)
-        return body if body.springs is None else replace(body, springs=None)
+        return replace(self.problem, material=law, springs=None, follower_loads=NO_LOADS)
 
     def support_forces(self) -> Tensor:
         """Return forces of moved supports and of follower loads at rest, (T + 1, N, D) [-].
