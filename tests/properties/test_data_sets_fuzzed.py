@@ -125,11 +125,6 @@ def law(scene, folder: Path, written: dict, *, trusts_digests: bool = True) -> N
                 or flaws
                 or torch.allclose(kept["values"], scene.loads.eigenmodes.values)
             )
-        for split, size in SIZES.items():
-            with reported(folder):
-                one = store.load(split, size, first=size - 1)
-                if trusts_digests:
-                    assert torch.equal(one.displacement[0], written[split].displacement[-1])
         with reported(folder):
             found = samples(scene, folder)
             assert same(found, written) or (not trusts_digests and flaws)
