@@ -395,6 +395,6 @@ def test_trace_of_a_gap_is_that_of_its_six_numbers(grid, bend):
     body = Problem.build(grid("hexahedron"), NeoHookeanLn(0.3), length=1.0)
     stretch = 0.2 * body.points[None] * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     gap = body.update_strain_gap(None, 1.0, stretch)
-    assert gap[0, 0, :, 0] == pytest.approx([0.04, 0.16, 0.36, 0, 0, 0], abs=1e-14)
+    assert gap[0][0, 0, :, 0] == pytest.approx([0.04, 0.16, 0.36, 0, 0, 0], abs=1e-14)
     E = as_tensor(gap, len(body.cells))
     assert trace(E) == pytest.approx(torch.full_like(trace(E), 0.28), abs=1e-14)
