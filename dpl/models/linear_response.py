@@ -201,7 +201,7 @@ class LinearResponse:
     def _orbits(self, device: torch.device) -> "_Orbits":
         if device not in self._orbits_on:
             parities, orbits, _ = self._form
-            places = torch.empty(orbits.images.max() + 1, dtype=torch.int64)
+            places = torch.empty(int(orbits.images.max()) + 1, dtype=torch.int64)
             places[orbits.images.flatten()] = torch.arange(orbits.images.numel())
             scales = orbits.sign * orbits.weight
             own = orbits.images, orbits.sign, scales, parities.characters, places, self._supports
