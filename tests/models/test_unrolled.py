@@ -12,7 +12,8 @@ from dpl.data import DataModule
 from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle, solve
 from dpl.fem.parity import Parities
 from dpl.fem.rom.pod import scatter_fields
-from dpl.fem.rom.reduced_stiffness import ReducedStiffness
+from dpl.fem.rom.reduced_stiffness import ReducedStiffness, reduced_terms
+from dpl.fem.rom.stiffness_iteration import StiffnessIteration
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import SymmetryGroup
 from dpl.inference import Simulator
@@ -256,17 +257,22 @@ def test_unbalanced_stress_is_of_second_order(name):
     assert unbalanced_stress(LAWS[name], H, H).abs().max() < 1e-9
 
 
-def test_reduced_stiffness_is_that_of_any_law(beam):
-    modes = torch.linalg.qr(torch.randn(int(beam.problem.free.sum()), 5).double())[0]
-    terms = StiffnessTerms.of(beam.problem)
-    parts = ReducedStiffness.of(terms, modes)
-    fields = torch.zeros(5, *beam.problem.shape).double()
-    fields[:, beam.problem.free] = modes.T
+def test_reduced_stiffness_is_that_of_any_law_of_a_range(beam):
+    problem = Problem.build(box((4, 1, 1), (5, 3, 3)), NeoHookeanLn((0.1, 0.45)), fixed=Plane(0, 0))
+    modes = torch.linalg.qr(torch.randn(int(problem.free.sum()), 5).double())[0]
+    terms = StiffnessTerms.of(problem)
+    reduced = ReducedStiffness(reduced_terms(terms, modes), StiffnessIteration.of_terms(terms))
+    fields, right = torch.zeros(5, *problem.shape).double(), torch.randn(3, 5).double()
+    fields[:, problem.free] = modes.T
     for law in (NeoHookeanLn(0.1), NeoHookeanLn(0.45)):
-        body = replace(beam.problem, material=law)
-        rest = torch.zeros_like(fields)
-        product = body.tangent_product(rest, fields)[:, body.free]
-        assert (parts.at(terms.factors(law))[0, :, :-1] - modes.T @ product.T).abs().max() < 1e-12
+        body, factors = replace(beam.problem, material=law), terms.factors(law)
+        product = body.tangent_product(torch.zeros_like(fields), fields)[:, body.free]
+        exact = modes.T @ product.T
+        assert (reduced.at(factors)[0, :, :-1] - exact).abs().max() < 1e-12
+        inverse = torch.from_numpy(reduced.inverse(factors)[0])
+        assert torch.allclose(inverse @ exact, torch.eye(5).double(), atol=1e-10)
+        expected = torch.linalg.solve(exact, right.T).T
+        assert (reduced.solve(factors, right) - expected).norm() < 1e-10 * expected.norm()
 
 
 def test_cell_gradients_of_a_linear_field(beam):

@@ -48,7 +48,7 @@ class ReducedStiffness:
             factors: a, (1, T) or (B, T).
             right: V^T f, (B, R).
         """
-        factors = pad(factors.to(right).expand(len(right), -1), (0, 1), value=1.0)
+        factors = pad(factors.to(right).expand(right.shape[0], -1), (0, 1), value=1.0)
         parts, inverse = self.parts.to(right), self._inverse.to(right)
         right = right - factors @ parts[..., -1]
         if not self._iteration.varies:
