@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import lightning as L
 import numpy as np
@@ -23,6 +23,7 @@ from dpl.fem import (
     Newton,
     Plane,
     Problem,
+    SubspaceNewton,
     Tag,
     box,
     propeller,
@@ -292,7 +293,9 @@ def trained(scene: Scene, data: DataModule, epochs: int) -> dict[str, Simulator]
         trainer.fit(surrogate, datamodule=data)
     states = data.samples("train").displacement
     found = {name: Simulator(surrogate) for name, surrogate in surrogates.items()}
-    found["pod + modes"] = Simulator.corrected(surrogates["pod"], states, rank=MODES)
+    vectors = cast(PODNet, surrogates["pod"].net).vectors[..., :MODES]
+    newton = SubspaceNewton.within(scene.problem, vectors, states[:256], tolerance=1e-2)
+    found["pod + modes"] = Simulator(surrogates["pod"], newton=newton)
     return found
 
 

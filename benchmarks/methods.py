@@ -4,16 +4,17 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, PODGalerkin
+from dpl.fem import Load, PODGalerkin, SubspaceNewton
 from dpl.inference.hybrid import Predict
-from dpl.models import Correctable, HasCorrection
 from dpl.scene import Sample, Scene
 from dpl.training import Surrogate
+
+CELL_STATES = 256  # states at which the cells of hyper-reduction are chosen
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def corrected(
     """Return a network whose predictions are corrected by Newton iterations in its modes.
 
     Args:
-        surrogate: A surrogate whose network is `Correctable`.
+        surrogate: A surrogate of a model that `HasCorrection`, or that has `vectors`, its modes.
         method: The method of the network alone.
         train: Training samples.
         rank: Number of modes of the correction; a model which `HasCorrection` has chosen it.
@@ -91,10 +92,12 @@ def corrected(
     Raises:
         ValueError: A number is out of range.
     """
-    net = cast(Correctable, surrogate.net)
     start = time.perf_counter()
-    own = net.correction() if isinstance(net, HasCorrection) else None
-    solver = own or net.galerkin(train.displacement, rank=rank, tolerance=tolerance)
+    if (solver := surrogate.predictor.correction()) is None:
+        net, states = cast(Any, surrogate.net), train.displacement[:CELL_STATES]
+        solver = SubspaceNewton.within(
+            surrogate.scene.problem, net.vectors[..., :rank], states, tolerance=tolerance
+        )
     minutes = (method.training_minutes or 0.0) + (time.perf_counter() - start) / 60
 
     def predict(load: Load) -> Tensor:

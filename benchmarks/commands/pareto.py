@@ -10,7 +10,7 @@ from rich.progress import Progress
 
 import dpl
 from benchmarks.commands import CONF
-from dpl import config, fem, inference, models
+from dpl import config, fem, inference
 from dpl.commands.cli import command
 from dpl.evaluation import tables
 
@@ -118,7 +118,7 @@ def trained_methods(
         loads = config.training_loads(trained)
         plain = methods.network(surrogate, Path(cfg.run) / name, loads)
         found[name, ""] = plain
-        if cfg.corrected and isinstance(surrogate.net, models.Correctable):
+        if cfg.corrected and {"correction", "vectors"} & set(dir(surrogate.net)):
             samples = data.snapshots()
             found[name, "corrected"] = _made(cfg, "corrected", surrogate, plain, samples)
     return found

@@ -60,12 +60,11 @@ def serve(
 
 
 def load_body(cfg: DictConfig) -> "viewer.Body":
-    """Return the body of the run; `galerkin_correction` needs a network with modes."""
+    """Return the body of the run."""
     import torch
 
     torch.set_num_threads(1)
-    with config.error_in("galerkin_correction"):
-        return viewer.Body(dpl.load(cfg.run, trust=cfg.trust, corrected=cfg.galerkin_correction))
+    return viewer.Body(dpl.load(cfg.run, trust=cfg.trust))
 
 
 def bind(cfg: DictConfig) -> "viewer.AccessPolicy":

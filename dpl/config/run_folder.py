@@ -14,7 +14,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dpl import data, inference, models, training
+from dpl import data, inference, training
 from dpl.config import validation
 from dpl.config.build import (
     SCENE,
@@ -209,27 +209,19 @@ def _reused_or_built(cfg: DictConfig, known: Scene | None) -> Scene:
     return known if math.isclose(length, known.length) else build_scene(cfg)
 
 
-def load(
-    folder: str | Path, *, trust: bool = False, corrected: bool = False
-) -> "inference.Simulator":
+def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":
     """Return the simulator of a training run.
 
     Args:
         folder: Folder of the run, as `runs/...`.
         trust: Import and call objects outside this package, such as your own law, that the
             configuration names.
-        corrected: Correct predictions by Newton's method in the modes of the network. Only for
-            `pod`, which needs the data set of the run for it; `unrolled` always has this method.
 
     Raises:
-        ValueError: There is no finished run, its checkpoint belongs to another scene, it names an
-            object that is not trusted, or its network has no modes.
+        ValueError: There is no finished run, its checkpoint belongs to another scene, or it names
+            an object that is not trusted.
     """
-    config, surrogate = load_run(folder, trust=trust)
-    if not corrected or isinstance(surrogate.net, models.HasCorrection):
-        return inference.Simulator(surrogate)
-    snapshots = load_data(config, surrogate.scene).snapshots()
-    return inference.Simulator.corrected(surrogate, snapshots.displacement)
+    return inference.Simulator(load_run(folder, trust=trust)[1])
 
 
 def load_runs(

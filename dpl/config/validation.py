@@ -20,7 +20,7 @@ KEYS: Keys = (  # of all commands
     (dict, "mesh material loads solver data model loss optimizer trainer"),
     (dict | None, "fixed regions supports forces scheduler callbacks logger"),
     (Mapping[str, float | str | bool | None] | None, "paths extras"),
-    (bool, "mean_dilatation trust resume solve_reference galerkin_correction"),
+    (bool, "mean_dilatation trust resume solve_reference"),
     (str, "name host"),
     (Literal["generate", "verify", "repair"], "action"),
     (Sequence[Literal["model", "results"]], "outputs"),

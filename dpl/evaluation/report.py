@@ -26,7 +26,6 @@ from dpl.fem import (
     write_mesh,
 )
 from dpl.inference import Corrected, Direct, Hybrid, Simulator
-from dpl.models import HasCorrection
 from dpl.scene import Sample, Scene
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, Surrogate
@@ -220,8 +219,7 @@ class _Simulated:
 
 def _step_in_modes(surrogate: Surrogate, tol: float) -> dict[str, Solver]:
     """Return the surrogate with one Newton step in its modes, if it has such a method."""
-    net = surrogate.net
-    newton = net.correction() if isinstance(net, HasCorrection) else None
+    newton = surrogate.predictor.correction()
     if newton is None:
         return {}
     one = replace(newton, tol=tol, max_iter=1, error_tol=LEAST_ERROR)

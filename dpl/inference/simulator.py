@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
@@ -28,7 +28,6 @@ from dpl.inference.grasp import Gripper
 from dpl.inference.hybrid import default_hybrid
 from dpl.inference.request import Candidate, Request
 from dpl.inference.training_range import RangeCheck
-from dpl.models import Correctable, HasCorrection
 from dpl.models.unrolled.correction import MAX_STEPS
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
@@ -67,8 +66,8 @@ class Simulator:
 
         Args:
             surrogate: A trained surrogate on the CPU.
-            newton: Newton's method in the modes of the model; None: that of a model which
-                `HasCorrection`.
+            newton: Newton's method in the modes of the model; None: that with which the model comes
+                (`HasCorrection`).
             steps: Largest number of steps, see the attributes; 0: predictions are not corrected.
 
         Raises:
@@ -76,8 +75,7 @@ class Simulator:
         """
         if steps < 0:
             raise ValueError(f"steps = {steps} must be 0 or more")
-        if newton is None and isinstance(surrogate.net, HasCorrection):
-            newton = surrogate.net.correction()
+        newton = surrogate.predictor.correction() if newton is None else newton
         self.surrogate, self.newton, self.steps = surrogate.eval(), newton, steps
         if newton is not None:
             newton.tangent  # noqa: B018  # built here, so that the first call is not slower
@@ -88,27 +86,6 @@ class Simulator:
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
         self.scene.is_compact, self.scene.is_softened  # noqa: B018
         self.scene.linear.reference.corotational  # noqa: B018  # so is the factor of the estimate
-
-    @classmethod
-    def corrected(
-        cls, surrogate: Surrogate, states: Tensor, *, rank: int = 60, tolerance: float = 1e-2
-    ) -> Self:
-        """Return a simulator that corrects predictions by equilibrium in the modes of the network.
-
-        Args:
-            surrogate: A trained surrogate on the CPU whose network is `Correctable`.
-            states: Displacements of training samples, (S, N, D) [-].
-            rank: Number of modes of the correction.
-            tolerance: Tolerance of the hyper-reduction, see `dpl.fem.rom.cubature`.
-
-        Raises:
-            ValueError: The network has no modes, or a number is out of range.
-        """
-        net = surrogate.net
-        if not isinstance(net, Correctable):
-            raise ValueError(f"corrected: {type(net).__name__} has no modes to correct in")
-        solver = net.galerkin(states, rank=rank, tolerance=tolerance)
-        return cls(surrogate, newton=solver)
 
     @property
     def scene(self) -> Scene:

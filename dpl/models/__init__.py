@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from dpl.models.pod import PODNet
     from dpl.models.protocols import (
         ClosedFormFit,
-        Correctable,
         HasBases,
         HasCorrection,
     )

@@ -5,7 +5,6 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from dpl.fem import SubspaceNewton
 from dpl.fem.rom.pod import pod
 from dpl.models.inputs import Inputs
 from dpl.models.precision import full_precision
@@ -14,7 +13,6 @@ from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
 MAX_BLOCKS = 1000
-CELL_STATES = 256  # states at which the cells of hyper-reduction are chosen
 
 
 class Block(nn.Module):
@@ -132,21 +130,11 @@ class PODNet(nn.Module):
         modes = _modes(weight * field, self.projection.shape[1])
         self.projection.copy_(modes / partial_whitening(root_mean_square(field @ modes)))
 
-    def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
-        """Return Newton's method in the first modes; see `Correctable`.
-
-        Args:
-            states: Equilibrium displacements, (S, N, D) [-]; cells are chosen at the first 256.
-            rank: Number of modes.
-            tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
-
-        Raises:
-            ValueError: A number is out of range.
-        """
-        problem = self.scene.problem
-        modes = self.modes[:rank].double().cpu()
-        vectors = torch.linalg.qr(modes[modes.any(dim=1)].T)[0].view(*problem.shape, -1)
-        return SubspaceNewton.within(problem, vectors, states[:CELL_STATES], tolerance=tolerance)
+    @property
+    def vectors(self) -> Tensor:
+        """Orthonormal modes of the displacement, the most important first, (N, D, R), float64."""
+        modes = self.modes.double().cpu()
+        return torch.linalg.qr(modes[modes.any(dim=1)].T)[0].view(*self.scene.problem.shape, -1)
 
     def skipped_work(self) -> list[str]:
         """Return the work that the network saves, one line each."""

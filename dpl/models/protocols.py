@@ -3,7 +3,7 @@
 A network of another package has a capability if it defines the methods; it need not inherit.
 """
 
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from torch import Tensor
 
@@ -27,7 +27,6 @@ class HasBases(Protocol):
         ...
 
 
-@runtime_checkable
 class ClosedFormFit(Protocol):
     """A model without trained parameters, which is fitted to all samples at once.
 
@@ -51,22 +50,6 @@ class ClosedFormFit(Protocol):
         ...
 
 
-@runtime_checkable
-class Correctable(Protocol):
-    """A model whose predictions Newton iterations in its modes can correct."""
-
-    def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
-        """Return the solver in the first `rank` modes, whose `correct` improves a prediction.
-
-        Args:
-            states: Equilibrium displacements, (S, N, D) [-].
-            rank: Number of modes.
-            tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
-        """
-        ...
-
-
-@runtime_checkable
 class HasCorrection(Protocol):
     """A model whose fit includes Newton's method in its modes."""
 

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from dpl.data.samples import Samples
-from dpl.fem import Load
+from dpl.fem import Load, SubspaceNewton
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.models.inputs import Base, Inputs
 from dpl.models.linear_base import LinearBase, sampled_solutions
-from dpl.models.protocols import HasBases
+from dpl.models.protocols import HasBases, HasCorrection
 from dpl.models.stored_buffers import StoredBuffers
 from dpl.scene import Sample, Scene
 from dpl.training.linear_samples import LinearBatch, LinearSamples, linear_solutions
@@ -118,6 +118,11 @@ class Predictor(StoredBuffers):
     def loss(self, batch: Any, loss: Loss, physics: LossContext) -> Tensor:
         """Return the loss of a batch of `dataset`, ()."""
         return loss(*self.predict_batch(batch), physics)
+
+    def correction(self) -> SubspaceNewton | None:
+        """Return Newton's method in the modes of a network that `HasCorrection`, else None."""
+        own = hasattr(self.net, "correction")
+        return cast(HasCorrection, self.net).correction() if own else None
 
     def describe(self, loss: Loss) -> str:
         """Return name and size of the network, and the loss."""

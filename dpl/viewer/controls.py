@@ -49,7 +49,7 @@ class Controls:
         young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
         parameters: Sliders of the ranges of law and follower loads, by name.
         sample, reset, fit: Buttons for a random load, for no load and for the camera.
-        method, budget, galerkin, quantity, edges, show_newton: Method and display.
+        method, budget, correction, quantity, edges, show_newton: Method and display.
         record, save: Buttons of the recording.
         of_load, of_moduli, of_settings: The widgets that change load or grasp, moduli or settings.
         follows_frame: True while a drag or a random load determines the load, so that the slider
@@ -80,7 +80,7 @@ class Controls:
         self.of_load = (self.direction, self.amplitude, self.uniform, *of_patch)
         self.of_moduli = (self.young, *self.parameters.values())
         shown = (self.quantity, self.edges, self.show_newton)
-        self.of_settings = (self.method, self.budget, self.galerkin, *shown)
+        self.of_settings = (self.method, self.budget, self.correction, *shown)
 
     def _add_load_controls(self) -> None:
         gui, body, loads = self._gui, self._body, self._body.scene.loads
@@ -120,12 +120,12 @@ class Controls:
         self.show_mode()
 
     def _add_method_controls(self) -> None:
-        gui, galerkin = self._gui, self._body.has_galerkin
+        gui, correction = self._gui, self._body.has_correction
         self.method = gui.add_dropdown("method", (*METHODS, BUDGET))
         self.budget = gui.add_number("budget [ms]", 20.0, min=0.1, max=10_000.0)
         hint = "correct the prediction in the modes of the network before Newton"
-        self.galerkin = gui.add_checkbox(
-            "Galerkin correction", galerkin, visible=galerkin, hint=hint
+        self.correction = gui.add_checkbox(
+            "Newton in the modes", correction, visible=correction, hint=hint
         )
         self.quantity = gui.add_dropdown("colours", tuple(QUANTITIES))
         self.edges = gui.add_checkbox("mesh edges", False)
@@ -173,7 +173,7 @@ class Controls:
             self.quantity.value,
             TOLERANCES[-1] if within_budget else METHODS.get(self.method.value),
             self.budget.value if within_budget else None,
-            bool(self.galerkin.value) and self._body.has_galerkin,
+            bool(self.correction.value) and self._body.has_correction,
             bool(self.show_newton.value),
         )
 

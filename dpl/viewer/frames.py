@@ -34,14 +34,14 @@ class ViewSettings:
         quantity: Quantity that colours show, a key of `QUANTITIES`.
         tol: Relative residual to reach [-]; None: the prediction of the network.
         budget_ms: Largest wall time [ms]; None: no limit.
-        galerkin: Correct the prediction in the modes of the network before Newton.
+        correction: Correct the prediction in the modes of the network before Newton.
         show_newton: Also show the iterates of Newton from zero displacement.
     """
 
     quantity: str = "displacement"
     tol: float | None = None
     budget_ms: float | None = None
-    galerkin: bool = False
+    correction: bool = False
     show_newton: bool = False
 
     def __post_init__(self) -> None:
@@ -114,13 +114,13 @@ class Body:
         self.young = self.scene.loads.moduli.middle
         ranges = self.scene.loads.parameter_ranges
         self.parameters = {name: ends.middle for name, ends in ranges.items()}
-        self._without_galerkin = simulator
-        if self.has_galerkin:
-            self._without_galerkin = Simulator(simulator.surrogate, steps=0)
+        self._uncorrected = simulator
+        if self.has_correction:
+            self._uncorrected = Simulator(simulator.surrogate, steps=0)
         self.patch = lru_cache(maxsize=1)(partial(Patch, self.scene))
 
     @property
-    def has_galerkin(self) -> bool:
+    def has_correction(self) -> bool:
         """True if the simulator can correct predictions in the modes of the network."""
         return self.simulator.newton is not None
 
@@ -193,7 +193,7 @@ class Body:
 
     def solve(self, request: ViewRequest, settings: ViewSettings) -> Frame:
         """Return the frame of a request, computed by the simulator."""
-        simulator = self.simulator if settings.galerkin else self._without_galerkin
+        simulator = self.simulator if settings.correction else self._uncorrected
         answer = request.answer(simulator, settings.tol, settings.budget_ms)
         reference: Tensor | float = 0.0
         if settings.quantity == ERROR:

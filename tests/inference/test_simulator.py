@@ -624,23 +624,6 @@ def test_a_trained_run_becomes_a_simulator(script, tiny_training, tmp_path):
         dpl.load(tmp_path / "runs" / "a")
 
 
-def test_a_run_between_coordinates_is_corrected_in_its_modes(script, tiny_training, tmp_path):
-    few = [*tiny_training, "trainer.max_epochs=1", "model.rank=8", "model.coordinates=8"]
-    for name in ("pod", "fcnn"):
-        kind = few if name == "pod" else few[:-2]
-        ended = script("train", *kind, f"model={name}", f"run=runs/{name}", cwd=tmp_path)
-        assert ended.status == 0, ended.err[-2000:]
-    sim = dpl.load(tmp_path / "runs" / "pod", corrected=True)
-    assert dpl.load(tmp_path / "runs" / "pod").newton is None
-    problem, load = sim.scene.problem, sim.scene.loads.sample((0, 9), range(3))
-    for force, exact in zip(load.force, solve(sim.scene.solver, load).displacement, strict=True):
-        fields = 0.97 * exact, sim.newton.correct(force, 0.97 * exact)
-        before, after = (problem.energy(u[None]) - (force * u).sum() for u in fields)
-        assert after < before, "nearer to balance"
-    with pytest.raises(ValueError, match="corrected: FCNN has no modes"):
-        dpl.load(tmp_path / "runs" / "fcnn", corrected=True)
-
-
 def test_the_corrector_is_the_solver_with_the_same_stiffness(scene):
     assert scene.corrector.linear_solver is scene.solver.linear_solver
     assert scene.corrector.tol == scene.solver.tol

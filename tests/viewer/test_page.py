@@ -368,9 +368,9 @@ def test_dots_lie_above_the_surface(page):
     assert (above > np.linalg.norm(points[marker.mask] - middle, axis=1)).all()
 
 
-def test_the_galerkin_correction_is_offered_if_the_simulator_has_one(page, tmp_path):
-    assert not page.controls.galerkin.visible
-    assert not page.controls.settings().galerkin
+def test_newtons_method_in_the_modes_is_offered_if_the_simulator_has_one(page, tmp_path):
+    assert not page.controls.correction.visible
+    assert not page.controls.settings().correction
     problem = page.body.scene.problem
     count = int(problem.free.sum())
     vectors = torch.zeros(*problem.shape, count, dtype=torch.float64)
@@ -380,12 +380,12 @@ def test_the_galerkin_correction_is_offered_if_the_simulator_has_one(page, tmp_p
     policy = AccessPolicy.bind("127.0.0.1", 0)
     other = Page(Body(simulator), policy, title="t", folder=tmp_path)
     try:
-        assert other.controls.galerkin.visible
-        assert other.worker.settings.galerkin
+        assert other.controls.correction.visible
+        assert other.worker.settings.correction
         other.sample(None)
         assert other.worker.wait(240)
         assert other.frame.answer.method == "corrected"
-        other.controls.galerkin.value = False
+        other.controls.correction.value = False
         other.apply_settings(None)
         assert other.worker.wait(240)
         assert other.frame.answer.method == "network"

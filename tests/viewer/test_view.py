@@ -80,21 +80,6 @@ def test_invalid_input_prints_one_line(script, home, arguments, words):
         assert ended.err.count("\n") == 1
 
 
-def test_a_refused_correction_names_its_key_and_a_data_set_its_folder(script, home, tmp_path):
-    more = ["galerkin_correction=true", "animation=a.gif"]
-    ended = script("view", "run=runs/a", *more, cwd=home)
-    assert ended.status == 2
-    assert ended.err.startswith("error: galerkin_correction: corrected: FCNN has no modes")
-    (data,) = (home / "datasets").iterdir()
-    (tmp_path / "datasets").mkdir()
-    (tmp_path / "datasets" / data.name).touch()
-    ended = script("view", f"run={home / 'runs' / 'a'}", *more, cwd=tmp_path)
-    assert ended.status == 2
-    assert (
-        ended.err == f"error: data.folder = datasets/{data.name} must be a folder; choose another\n"
-    )
-
-
 def test_a_port_in_use_is_reported(script, home):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

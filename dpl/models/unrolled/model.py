@@ -27,7 +27,6 @@ from dpl.system.threads import on_threads
 
 FEW = 8  # loads at which the error outside the modes is measured
 LARGER = 3.0  # ratio of a measured to a stored error up to which both are plausible
-CELL_STATES = 256  # states at which the cells of a correction are chosen
 MAX_SIZE = 100_000  # of rank, cells and stages
 # buffers and axes with the numbers of modes, cells, maps, and modes and cells of Newton's method
 SIZES = (("modes", 1), ("cells", 0), ("maps", 0), ("newton_modes", 1), ("newton_cells", 0))
@@ -334,22 +333,6 @@ class Unrolled(StoredBuffers):
         measured = remaining_error(solver, self.scene.linear, load, guesses)
         stored = float(self.outside_error)  # of more loads, by their solutions
         return replace(solver, outside_error=stored if measured <= LARGER * stored else measured)
-
-    def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
-        """Return Newton's method in the first modes; see `Correctable`.
-
-        Args:
-            states: Equilibrium displacements, (S, N, D) [-]; cells are chosen at the first 256.
-            rank: Number of modes.
-            tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
-
-        Raises:
-            ValueError: A number is out of range.
-        """
-        some = states[:CELL_STATES]
-        problem = self.scene.problem
-        modes = orthonormal_fields(self.modes[:, :rank], problem.free)
-        return SubspaceNewton.within(problem, modes, some, tolerance=tolerance)
 
     def skipped_work(self) -> list[str]:
         """Return the work that the model saves, one line each."""
