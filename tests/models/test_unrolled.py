@@ -17,7 +17,7 @@ from dpl.fem.rom.stiffness_iteration import StiffnessIteration
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import SymmetryGroup
 from dpl.inference import Simulator
-from dpl.models import ClosedFormFit, HasCorrection, Unrolled
+from dpl.models import Unrolled
 from dpl.models.unrolled.correction import choose_newton
 from dpl.models.unrolled.features import cell_gradients, rotated_strain, rotation, unbalanced_stress
 from dpl.models.unrolled.fit import modes_of_parity
@@ -170,9 +170,6 @@ def test_weights_are_stored_with_the_sizes_of_the_fit(beam, net):
     force = beam.loads.sample(8, range(3)).force
     assert other.is_fitted
     assert torch.equal(other(force), net(force))
-
-
-def test_protocols(net):
 
 
 def test_the_surrogate_predicts_in_si_units(beam, net):
