@@ -198,8 +198,9 @@ class Parametrised:
         if not names:
             return self
         values: Any = parameters.T[..., None, None]  # beside cells and points
+        # a traced graph has no values, and `len` would fix the size of its batch
         compiling = torch.compiler.is_compiling()
-        if len(parameters) == 1 and not parameters.requires_grad and not compiling:
+        if not compiling and len(parameters) == 1 and not parameters.requires_grad:
             values = parameters[0].tolist()
         return replace(cast("Any", self), **dict(zip(names, values, strict=True)))
 
