@@ -86,12 +86,6 @@ class Scene:
     solver: ReferenceSolver
 
     def __post_init__(self) -> None:
-        """Check that body and loads have one Young's modulus if the body needs one.
-
-        Raises:
-            ValueError: The loads have another modulus than elastic foundations and follower
-                loads, or a range.
-        """
         if self.problem.has_one_modulus:
             for young in self.loads.moduli:
                 self.problem.check_modulus(young)

@@ -61,7 +61,6 @@ class DataSet:
     shards: int = 1
 
     def __post_init__(self) -> None:
-        """Raise ValueError if a number is out of range."""
         check_range(0, 2**32 - 1, seed=self.seed)
         check_range(0, MAX_LOADS, **self.sizes)
         check_range(0, MAX_WORKERS, workers=self.workers)

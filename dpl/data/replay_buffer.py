@@ -70,7 +70,6 @@ class ReplayBuffer:
     rates: StreamRates | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        """Start without samples."""
         self._buffer = _Buffer(self.capacity, self.reuse)
         self._batches = self._draw()
         self._generator = torch.Generator().manual_seed(self.seed)

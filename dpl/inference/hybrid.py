@@ -57,11 +57,6 @@ class Direct:
     tol: float = 1e-8
 
     def __post_init__(self) -> None:
-        """Check the tolerance.
-
-        Raises:
-            ValueError: It is out of range.
-        """
         check_tol(self.tol)
 
     def iterate(self, load: Load) -> Iterator[Solution]:
@@ -124,11 +119,6 @@ class Hybrid:
     steps: AndersonSolver | None = None
 
     def __post_init__(self) -> None:
-        """Check the rule.
-
-        Raises:
-            ValueError: There is no such rule.
-        """
         if self.rule not in RULES:
             raise ValueError(f"rule = {self.rule!r} must be {' or '.join(RULES)}")
 

@@ -148,7 +148,6 @@ class Step(StoredBuffers):
         self.register_buffer("share", torch.from_numpy(1 / np.bincount(cluster)).float())
 
     def check_buffers(self) -> None:
-        """See `StoredBuffers`."""
         check_indices(self.clusters, cluster=self.cluster)
 
     def sum(self, values: Tensor) -> Tensor:

@@ -52,7 +52,6 @@ class Level(StoredBuffers):
         self.place = nn.Sequential(nn.Linear(dim + 1, width), nn.GELU(), nn.Linear(width, width))
 
     def check_buffers(self) -> None:
-        """See `StoredBuffers`."""
         check_indices(len(self.flags), receiver=self.receiver, sender=self.sender)
 
     def forward(self, force: Tensor, moment: Tensor) -> Tensor:

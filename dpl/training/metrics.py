@@ -81,7 +81,6 @@ class _OfProblem(_PerLoad):
         return self.reduce(dim_zero_cat(self.values)[:, self.column])
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        """See `_PerLoad`."""
         return self._evaluate(prediction, batch)[:, self.column]
 
     def _evaluate(self, prediction: Tensor, batch: Sample) -> Tensor:
@@ -101,7 +100,6 @@ class MeanError(_PerLoad):
     reduce = staticmethod(torch.mean)
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        """See `_PerLoad`."""
         return _error(prediction, batch) / prediction[0].numel()
 
 
@@ -111,7 +109,6 @@ class MaxError(_PerLoad):
     reduce = staticmethod(torch.max)
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        """See `_PerLoad`."""
         return (prediction - batch.displacement).norm(dim=2).amax(dim=1)
 
 
@@ -128,7 +125,6 @@ class MinSNR(_PerLoad):
         self.factor = 10 if printed else 20
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        """See `_PerLoad`."""
         ratio = prediction.flatten(1).norm(dim=1) / _error(prediction, batch)
         return self.factor * ratio.log10()
 
@@ -141,7 +137,6 @@ class RelativeL2(_PerLoad):
         self.reduce = torch.max if worst else median
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        """See `_PerLoad`."""
         return _error(prediction, batch) / batch.displacement.flatten(1).norm(dim=1)
 
 

@@ -78,9 +78,6 @@ class Muon(torch.optim.AdamW):
             momentum: Momentum of Muon.
             betas: Averaging coefficients of Adam.
             weight_decay: Decoupled weight decay of both.
-
-        Raises:
-            ValueError: A number is out of range.
         """
         if not 0 <= momentum < 1:
             raise ValueError(f"momentum = {momentum} must be 0 or more and less than 1")

@@ -163,11 +163,7 @@ class Controls:
         self.young.value = within / self._young_unit
 
     def settings(self) -> ViewSettings:
-        """Return method and quantity.
-
-        Raises:
-            ValueError: A value is out of range.
-        """
+        """Return method and quantity."""
         within_budget = self.method.value == BUDGET
         return ViewSettings(
             self.quantity.value,

@@ -66,11 +66,6 @@ class BodyForce:
     density: float | None = None
 
     def __post_init__(self) -> None:
-        """Check that the force is given once.
-
-        Raises:
-            ValueError: The force is given twice or not at all, or `density` is out of range.
-        """
         remedy = "give value [N/m^3] alone, or acceleration [m/s^2] and density [kg/m^3]"
         for name in ("acceleration", "density"):
             given = getattr(self, name)

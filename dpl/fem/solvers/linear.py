@@ -39,11 +39,6 @@ class LinearSolver:
     parent: "LinearSolver | None" = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the tolerance.
-
-        Raises:
-            ValueError: The tolerance is out of range.
-        """
         check_tol(self.tol)
 
     @cached_property

@@ -81,7 +81,6 @@ class Newton:
     linear_solver: LinearSolver = field(default=None, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Check the ranges and make the linear solver if none fits."""
         check_steps(self, parts=("intermediate_tol", "min_detF_ratio", "min_load_step"))
         select_backend(self.linear)
         given = self.linear_solver

@@ -120,9 +120,6 @@ class Unrolled(StoredBuffers):
             cells: Largest number of sample cells; a few more, if symmetries demand it.
             stages: Largest number of iterations after the first map.
             symmetry: Find the symmetries of the body and build them into the answer.
-
-        Raises:
-            ValueError: A number is out of range.
         """
         super().__init__()
         check_range(1, MAX_SIZE, rank=rank, cells=cells)
@@ -322,7 +319,6 @@ class Unrolled(StoredBuffers):
         self.outside_error = torch.tensor(found.outside_error, dtype=torch.float64)
 
     def correction(self) -> SubspaceNewton | None:
-        """See `HasCorrection`."""
         if not self.newton_modes.shape[1]:
             return None
         problem, load = self.scene.problem, self.scene.loads.sample((0, SCALE_STREAM), range(FEW))
@@ -358,7 +354,6 @@ class Unrolled(StoredBuffers):
         self._prepare()
 
     def check_buffers(self) -> None:
-        """See `StoredBuffers`."""
         problem = self.scene.problem
         count, cells = len(problem.cells), self.cells
         check_indices(count, cells=cells, newton_cells=self.newton_cells)

@@ -36,7 +36,6 @@ class EnergyNormLoss(Loss):
         self._rest: RestStiffness | None = None
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        """See `Loss`."""
         self._rest = rest = RestStiffness.of(physics.problem, self._rest)
         with torch.no_grad():
             fields = torch.cat([prediction - batch.displacement, batch.displacement])
@@ -82,7 +81,6 @@ class PotentialEnergyLoss(Loss):
         self._rest: RestStiffness | None = None
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        """See `Loss`."""
         self._rest = rest = RestStiffness.of(physics.problem, self._rest)
         with torch.no_grad():
             scale = clamp_scale(

@@ -72,9 +72,6 @@ class BlendedLoss(Loss):
             second: Loss from the epoch `start + epochs` on; should have the magnitude of `first`.
             epochs: Number of epochs in which the weight rises linearly from 0 to 1.
             start: Epoch in which the weight begins to rise.
-
-        Raises:
-            ValueError: A number is out of range.
         """
         super().__init__()
         check_range(1, epochs=epochs)

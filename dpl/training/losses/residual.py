@@ -32,7 +32,6 @@ class LrStar(Loss):
         self.per_sample = per_sample
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        """See `Loss`."""
         error = squared_error(prediction, batch)
         weight = residual_norm(prediction.detach(), batch, physics)
         weight = weight if self.per_sample else weight.mean()
@@ -68,7 +67,6 @@ class LrPlus(Loss):
             self.weight = self._final * min(1.0, trainer.current_epoch / self._warmup)
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        """See `Loss`."""
         error = squared_error(prediction, batch).mean()
         residual = residual_norm(prediction, batch, physics).mean()
         self.terms = {"mse": error, "residual": residual}

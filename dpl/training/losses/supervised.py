@@ -21,16 +21,12 @@ class MSE(Loss):
             relative: Exponent of the mean squared displacement by which the error of each sample is
                 divided. 1 gives relative errors, 0 absolute errors.
             floor: See `clamp_scale`; has no effect if `relative` is 0.
-
-        Raises:
-            ValueError: A number is out of range.
         """
         super().__init__()
         check_range(0, 1, relative=relative, floor=floor)
         self.relative, self.floor = relative, floor
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        """See `Loss`."""
         return self._weighted_errors(prediction, batch).mean()
 
     def _weighted_errors(self, prediction: Tensor, batch: Sample) -> Tensor:
@@ -50,5 +46,4 @@ class RMSELoss(MSE):
     """
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        """See `Loss`."""
         return (self._weighted_errors(prediction, batch) + SMALLEST_SQUARE).sqrt().mean()
