@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from dpl import Sample
+from dpl import Sample, fem
 from dpl.export import (
     ExportGraph,
     OnnxSession,
@@ -27,16 +27,6 @@ from dpl.export.comparison import relative_differences, sample_check_loads
 from dpl.export.folder import read_raw
 from dpl.export.metadata import describe, solve_reference
 from dpl.export.onnx_graph import missing_packages
-from dpl.fem import (
-    ConstantFibres,
-    FibreReinforced,
-    Guccione,
-    Load,
-    NeoHookeanIsoK2,
-    rectangle,
-    solve,
-    surface,
-)
 from dpl.fem.postprocess import triangles
 from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
 from dpl.training import MSE, Surrogate
@@ -57,11 +47,11 @@ def make_surrogate(make, scene, seed=0, **options):
     surrogate = Surrogate.from_network(network, MSE(), scene, **inputs)
     if surrogate.predictor.lacks_bases:
         load = scene.loads.sample((0, 1), range(8))
-        truth = solve(scene.solver, load).displacement
+        truth = fem.solve(scene.solver, load).displacement
         surrogate.fit_bases(Sample(load.force, truth, load.young, load.parameters))
     if isinstance(surrogate.net, Unrolled):
         load = scene.loads.sample((0, 1), range(40))
-        truth = solve(scene.solver, load).displacement
+        truth = fem.solve(scene.solver, load).displacement
         samples = Sample(load.force, truth, load.young, load.parameters)
         surrogate.net.fit(samples, samples)
     return surrogate.eval()
@@ -69,8 +59,10 @@ def make_surrogate(make, scene, seed=0, **options):
 
 def fibres_in_a_matrix(poisson):
     """Return a law with three ranges, in which K(0) has three terms."""
-    matrix = NeoHookeanIsoK2([poisson, 0.4], [0.5, 2.0])
-    return FibreReinforced(matrix, Guccione([0.1, 1.0], 8.0, 2.0, 4.0), ConstantFibres([2, 1, 0]))
+    matrix = fem.NeoHookeanIsoK2([poisson, 0.4], [0.5, 2.0])
+    return fem.FibreReinforced(
+        matrix, fem.Guccione([0.1, 1.0], 8.0, 2.0, 4.0), fem.ConstantFibres([2, 1, 0])
+    )
 
 
 NETWORKS = {
@@ -132,7 +124,7 @@ def make_graph(make_scene, tmp_path_factory):
         if name not in graphs:
             make, options, scene = NETWORKS[name]
             scene = {
-                key: rectangle([100.0, 25.0], [9, 3]) if value == "strip" else value
+                key: fem.rectangle([100.0, 25.0], [9, 3]) if value == "strip" else value
                 for key, value in scene.items()
             }
             graph = ExportGraph(make_surrogate(make, make_scene(**scene), **options))
@@ -329,7 +321,9 @@ def test_the_training_range_can_be_checked_without_this_package(write_export):
     scene, meta = graph.surrogate.scene, read_metadata(folder)
     modes = read_raw(folder / "modes.f64", meta["range"]["modes"]["shape"])
     load = scene.loads.sample((0, 13), range(6))
-    load = Load(torch.cat([load.force, 3 * load.force, torch.ones_like(load.force)]), load.young)
+    load = fem.Load(
+        torch.cat([load.force, 3 * load.force, torch.ones_like(load.force)]), load.young
+    )
     amplitude, out_of_span = scene.loads.project(load.force)
     for k, force in enumerate(load.force.numpy()):
         force.reshape(-1)[meta["dofs"]["fixed"]] = 0.0
@@ -347,9 +341,9 @@ def test_the_training_range_can_be_checked_without_this_package(write_export):
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
 def test_triangles_enclose_the_body_and_have_outward_normals(make_scene, cell):
     flat = cell in ("quad", "triangle")
-    body = {"mesh": rectangle([100.0, 25.0], [5, 3], cell)} if flat else {"cell": cell}
+    body = {"mesh": fem.rectangle([100.0, 25.0], [5, 3], cell)} if flat else {"cell": cell}
     problem = make_scene(**body).problem
-    corners = problem.points.numpy()[triangles(surface(problem.mesh))]
+    corners = problem.points.numpy()[triangles(fem.surface(problem.mesh))]
     edges = corners[:, 1:] - corners[:, :1]
     if flat:
         assert np.linalg.det(edges).sum() / 2 == pytest.approx(0.25)

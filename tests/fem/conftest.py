@@ -9,15 +9,7 @@ import torch
 from laws import ISOTROPIC, LAWS
 from torch import Tensor
 
-from dpl.fem import (
-    Material,
-    NeoHookeanLn,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    box,
-    rectangle,
-)
+from dpl import fem
 from dpl.fem.linear import SuperLU
 from dpl.fem.loads import traction
 
@@ -25,26 +17,26 @@ YOUNG, LENGTH = 4500.0, 100.0  # of the paper's beam [Pa], [m]
 KINDS = [(cell, d) for cell in ("triangle", "quad", "tetra", "hexahedron") for d in (1, 2)]
 
 
-@pytest.fixture(params=[SaintVenantKirchhoff, NeoHookeanLn], ids=["svk", "neo-hookean"])
-def law(request) -> Material:
+@pytest.fixture(params=[fem.SaintVenantKirchhoff, fem.NeoHookeanLn], ids=["svk", "neo-hookean"])
+def law(request) -> fem.Material:
     """The two laws of the tables for bodies, at a Poisson ratio of 0.3."""
     return request.param(0.3)
 
 
 @pytest.fixture(scope="session")
-def laws() -> dict[str, Material]:
+def laws() -> dict[str, fem.Material]:
     """All laws by name."""
     return LAWS
 
 
 @pytest.fixture(params=LAWS)
-def any_law(request) -> Material:
+def any_law(request) -> fem.Material:
     """Each of all laws."""
     return LAWS[request.param]
 
 
 @pytest.fixture(params=ISOTROPIC)
-def isotropic_law(request) -> Material:
+def isotropic_law(request) -> fem.Material:
     """Each law without fibres."""
     return LAWS[request.param]
 
@@ -60,7 +52,7 @@ def grid() -> Callable[..., skfem.Mesh]:
     """Grids of unit size, `count` cells a side, their vertices shaken by a part of the cell."""
 
     def grid(cell: str, count: int = 2, shaken: float = 0.0, *, inside: bool = False) -> skfem.Mesh:
-        build, dim = (box, 3) if cell in ("tetra", "hexahedron") else (rectangle, 2)
+        build, dim = (fem.box, 3) if cell in ("tetra", "hexahedron") else (fem.rectangle, 2)
         mesh = build([1.0] * dim, [count + 1] * dim, cell)
         shift = np.random.default_rng(7).uniform(-shaken / count, shaken / count, mesh.p.shape)
         if inside:  # the boundary stays where it is
@@ -77,7 +69,7 @@ def chain() -> Callable[..., skfem.Mesh]:
     def chain(cell: str, count: int) -> skfem.Mesh:
         dim = 3 if cell in ("tetra", "hexahedron") else 2
         if cell in ("quad", "hexahedron"):
-            build = box if dim == 3 else rectangle
+            build = fem.box if dim == 3 else fem.rectangle
             return build([count, *[1.0] * (dim - 1)], [count + 1, *[2] * (dim - 1)], cell)
         spine = np.pad(np.arange(count + 1.0)[:, None], ((0, 0), (0, dim - 1)))
         tips = [spine[:-1] + axis for axis in np.eye(dim)[1:]]
@@ -106,13 +98,15 @@ def bend() -> Callable[..., Tensor]:
 
 
 @pytest.fixture(scope="session")
-def beam() -> Callable[..., Problem]:
+def beam() -> Callable[..., fem.Problem]:
     """The beam 100 x 25 x 25 m clamped at x = 0, the paper's, in (n, m, m) cells."""
 
-    def beam(material: Material, n: int = 8, m: int = 2, **options) -> Problem:
+    def beam(material: fem.Material, n: int = 8, m: int = 2, **options) -> fem.Problem:
         cell, degree = options.pop("cell", "hexahedron"), options.pop("degree", 1)
-        mesh = box([LENGTH, 25.0, 25.0], [n + 1, m + 1, m + 1], cell)
-        return Problem.build(mesh, material, fixed=Plane(0, "min"), degree=degree, **options)
+        mesh = fem.box([LENGTH, 25.0, 25.0], [n + 1, m + 1, m + 1], cell)
+        return fem.Problem.build(
+            mesh, material, fixed=fem.Plane(0, "min"), degree=degree, **options
+        )
 
     return beam
 
@@ -121,20 +115,20 @@ def beam() -> Callable[..., Problem]:
 def pull() -> Callable[..., Tensor]:
     """Nodal forces (1, N, 3) of the dead traction (0, 0, -q) [Pa] on the end x = max."""
 
-    def pull(problem: Problem, q: float) -> Tensor:
+    def pull(problem: fem.Problem, q: float) -> Tensor:
         def stress(x):
             return np.multiply.outer([0.0, 0.0, -q / YOUNG], np.ones(x.shape[1:]))
 
-        return traction(problem, Plane(0, "max"), stress)[None]
+        return traction(problem, fem.Plane(0, "max"), stress)[None]
 
     return pull
 
 
 @pytest.fixture(scope="session")
-def corner() -> Callable[[Problem, Tensor], Tensor]:
+def corner() -> Callable[[fem.Problem, Tensor], Tensor]:
     """Displacement (3,) [-] of the corner (max, max, max) of a box."""
 
-    def corner(problem: Problem, displacement: Tensor) -> Tensor:
+    def corner(problem: fem.Problem, displacement: Tensor) -> Tensor:
         return displacement[0, int(problem.points.sum(dim=1).argmax())]
 
     return corner

@@ -3,42 +3,30 @@
 import pytest
 import torch
 
-from dpl.fem import (
-    Load,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Solution,
-    Status,
-    Traction,
-    box,
-    post_buckling_branches,
-    solve,
-)
+from dpl import fem
 from dpl.fem.solvers import unstable_directions
 
 
 @pytest.fixture(scope="module")
-def column() -> Newton:
+def column() -> fem.Newton:
     """A column 10 x 1 x 0.8 of quadratic hexahedra, nu = 0, clamped at its foot."""
-    mesh = box([10.0, 1.0, 0.8], [11, 2, 2])
-    law = SaintVenantKirchhoff(0.0)
-    return Newton(Problem.build(mesh, law, fixed=Plane(0, "min"), degree=2))
+    mesh = fem.box([10.0, 1.0, 0.8], [11, 2, 2])
+    law = fem.SaintVenantKirchhoff(0.0)
+    return fem.Newton(fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=2))
 
 
 @pytest.fixture(scope="module")
-def pressed(column) -> tuple[Load, Solution]:
+def pressed(column) -> tuple[fem.Load, fem.Solution]:
     """The column under 2.5 times its critical load, straight: pi^2 E I / (4 l^2)."""
     critical = torch.pi**2 * (1.0 * 0.8**3 / 12) / 400
-    force = Traction(Plane(0, "max"), [-2.0 * critical / 0.8, 0.0, 0.0]).on(column.problem)
-    load = Load(force[None], torch.ones(1, dtype=torch.float64))
-    return load, solve(column, load)
+    force = fem.Traction(fem.Plane(0, "max"), [-2.0 * critical / 0.8, 0.0, 0.0]).on(column.problem)
+    load = fem.Load(force[None], torch.ones(1, dtype=torch.float64))
+    return load, fem.solve(column, load)
 
 
 def test_straight_column_beyond_its_critical_load_is_unstable(pressed):
     _, answer = pressed
-    assert answer.status[0] == Status.UNSTABLE
+    assert answer.status[0] == fem.Status.UNSTABLE
     assert answer.converged[0]
     assert not answer.stable[0]
     assert answer.negative_pivots[0] == 2  # 2 P_cr > 1.5625 P_cr, the stiffer way
@@ -63,10 +51,10 @@ def test_unstable_directions_lower_the_energy(column, pressed):
 
 def test_column_buckles_to_either_side(column, pressed):
     load, straight = pressed
-    left, right = post_buckling_branches(column, load, straight)
+    left, right = fem.post_buckling_branches(column, load, straight)
     problem = column.problem
     for answer in (left, right):
-        assert answer.status[0] == Status.CONVERGED
+        assert answer.status[0] == fem.Status.CONVERGED
         assert answer.negative_pivots[0] == 0
         energy = problem.energy(answer.displacement) - (load.force * answer.displacement).sum()
         assert energy < problem.energy(straight.displacement) - (
@@ -80,10 +68,10 @@ def test_column_buckles_to_either_side(column, pressed):
 
 
 def test_stable_solution_has_no_unstable_direction(column):
-    force = Traction(Plane(0, "max"), [1e-5, 0.0, 0.0]).on(column.problem)
-    load = Load(force[None], torch.ones(1, dtype=torch.float64))
-    answer = solve(column, load)
+    force = fem.Traction(fem.Plane(0, "max"), [1e-5, 0.0, 0.0]).on(column.problem)
+    load = fem.Load(force[None], torch.ones(1, dtype=torch.float64))
+    answer = fem.solve(column, load)
     with pytest.raises(ValueError, match="no unstable direction"):
         unstable_directions(column, answer)
     with pytest.raises(ValueError, match="no unstable direction"):
-        post_buckling_branches(column, load, answer)
+        fem.post_buckling_branches(column, load, answer)

@@ -9,27 +9,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem import (
-    Box,
-    DirichletBC,
-    LinearElastic,
-    Load,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    RobinBC,
-    SaintVenantKirchhoff,
-    Traction,
-    box,
-    rectangle,
-    solve,
-)
+from dpl import fem
 from dpl.fem.linear import full_matrix
 
-NH = NeoHookeanLn(0.3)
-LEFT, RIGHT = Plane(0, "min"), Plane(0, "max")
-NOTHING = Plane(0, 0.4321)
+NH = fem.NeoHookeanLn(0.3)
+LEFT, RIGHT = fem.Plane(0, "min"), fem.Plane(0, "max")
+NOTHING = fem.Plane(0, 0.4321)
 
 
 @pytest.fixture
@@ -42,23 +27,23 @@ def dim(kind) -> int:
 def held(kind, grid):
     """Builds unit bodies, lengths over 4 m, of each kind of element, with supports."""
 
-    def held(*supports, **options) -> Problem:
+    def held(*supports, **options) -> fem.Problem:
         mesh = grid(kind[0], 2, 0.12, inside=True).scaled(4.0)
-        return Problem.build(mesh, NH, supports=supports, degree=kind[1], **options)
+        return fem.Problem.build(mesh, NH, supports=supports, degree=kind[1], **options)
 
     return held
 
 
-def answer_of(problem: Problem, force: torch.Tensor | None = None, **options):
+def answer_of(problem: fem.Problem, force: torch.Tensor | None = None, **options):
     """Return the solution under a load, none if left out."""
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    load = Load(rest if force is None else force[None], torch.ones(1))
-    return solve(Newton(problem, linear="superlu", **options), load)
+    load = fem.Load(rest if force is None else force[None], torch.ones(1))
+    return fem.solve(fem.Newton(problem, linear="superlu", **options), load)
 
 
 def test_a_condition_without_value_fixes_all_components_of_its_nodes(held):
     """The default value, the same as `fixed`."""
-    clamped, fixed = held(DirichletBC(LEFT)), held(fixed=LEFT)
+    clamped, fixed = held(fem.DirichletBC(LEFT)), held(fixed=LEFT)
     assert torch.equal(clamped.free, fixed.free)
     assert (~clamped.free).sum() > 0
     assert not clamped.prescribed.any()
@@ -69,7 +54,7 @@ def test_component_without_a_value_stays_free(held, dim):
     for axis in range(dim):
         value = [None] * dim
         value[axis] = 0.0
-        problem = held(DirichletBC(LEFT, value))
+        problem = held(fem.DirichletBC(LEFT, value))
         on_plane = problem.points[:, 0] < 1e-9
         expected = torch.zeros(dim, dtype=torch.bool)
         expected[axis] = True
@@ -78,7 +63,7 @@ def test_component_without_a_value_stays_free(held, dim):
 
 def test_value_is_a_length_in_metres(held, dim):
     value = [0.4, None, -0.2][:dim]
-    problem = held(DirichletBC(RIGHT, value))
+    problem = held(fem.DirichletBC(RIGHT, value))
     right = problem.points[:, 0] > 1 - 1e-9
     assert problem.length == pytest.approx(4.0)
     assert problem.moved_supports
@@ -92,13 +77,13 @@ def test_value_is_a_length_in_metres(held, dim):
 
 
 def test_an_integer_is_a_value_too(held, dim):
-    problem = held(DirichletBC(RIGHT, [2, *[None] * (dim - 1)]))
+    problem = held(fem.DirichletBC(RIGHT, [2, *[None] * (dim - 1)]))
     assert problem.prescribed.max().item() == pytest.approx(0.5, rel=1e-14)
 
 
 def test_the_last_value_of_a_component_applies(held, dim):
-    first = DirichletBC(LEFT, [0.4] * dim)
-    second = DirichletBC(LEFT, [-0.8, *[None] * (dim - 1)])
+    first = fem.DirichletBC(LEFT, [0.4] * dim)
+    second = fem.DirichletBC(LEFT, [-0.8, *[None] * (dim - 1)])
     left = held().points[:, 0] < 1e-9
     for supports, value in (((first, second), -0.2), ((second, first), 0.1)):
         problem = held(*supports)
@@ -107,7 +92,7 @@ def test_the_last_value_of_a_component_applies(held, dim):
 
 
 def test_a_boundary_condition_overrides_fixed_nodes(held, dim):
-    problem = held(DirichletBC(LEFT, [0.4, *[None] * (dim - 1)]), fixed=LEFT)
+    problem = held(fem.DirichletBC(LEFT, [0.4, *[None] * (dim - 1)]), fixed=LEFT)
     left = problem.points[:, 0] < 1e-9
     assert not problem.free[left].any()
     assert_close(problem.prescribed[left][:, 0].unique(), torch.tensor([0.1]).double())
@@ -115,12 +100,12 @@ def test_a_boundary_condition_overrides_fixed_nodes(held, dim):
 
 
 def test_a_free_component_of_a_boundary_condition_does_not_free_fixed_nodes(held, dim):
-    problem = held(DirichletBC(LEFT, [*[None] * (dim - 1), 0.0]), fixed=LEFT)
+    problem = held(fem.DirichletBC(LEFT, [*[None] * (dim - 1), 0.0]), fixed=LEFT)
     assert torch.equal(problem.free, held(fixed=LEFT).free)
 
 
 def test_supports_on_different_regions_add_up(held):
-    both = held(DirichletBC(LEFT), DirichletBC(RIGHT))
+    both = held(fem.DirichletBC(LEFT), fem.DirichletBC(RIGHT))
     assert torch.equal(both.free, held(fixed=LEFT).free & held(fixed=RIGHT).free)
 
 
@@ -129,17 +114,20 @@ def test_supports_on_different_regions_add_up(held):
 )
 def test_value_of_the_wrong_length_is_an_error(grid, value):
     with pytest.raises(ValueError, match="must be 3 lengths"):
-        Problem.build(grid("hexahedron"), NH, supports=[DirichletBC(LEFT, value)])
+        fem.Problem.build(grid("hexahedron"), NH, supports=[fem.DirichletBC(LEFT, value)])
 
 
 def test_value_with_three_components_is_an_error_in_2d(grid):
     with pytest.raises(ValueError, match="must be 2 lengths"):
-        Problem.build(grid("quad"), NH, supports=[DirichletBC(LEFT, [0.0, 0.0, 0.0])])
+        fem.Problem.build(grid("quad"), NH, supports=[fem.DirichletBC(LEFT, [0.0, 0.0, 0.0])])
 
 
 @pytest.mark.parametrize(
     ("support", "what"),
-    [(DirichletBC(NOTHING), "no node"), (RobinBC(NOTHING, 1.0), "no facet of the boundary")],
+    [
+        (fem.DirichletBC(NOTHING), "no node"),
+        (fem.RobinBC(NOTHING, 1.0), "no facet of the boundary"),
+    ],
 )
 def test_empty_region_is_an_error(held, support, what):
     with pytest.raises(ValueError, match=what):
@@ -153,19 +141,19 @@ def test_empty_region_is_an_error(held, support, what):
 )
 def test_stiffness_out_of_range_is_an_error(grid, stiffness):
     with pytest.raises(ValueError, match="stiffness"):
-        Problem.build(grid("hexahedron"), NH, supports=[RobinBC(LEFT, stiffness)])
+        fem.Problem.build(grid("hexahedron"), NH, supports=[fem.RobinBC(LEFT, stiffness)])
 
 
 def test_moved_supports_stretch_the_body():
     """A bar stretched by 50 % has the lateral stretch of uniaxial stress."""
-    mesh = box([2.0, 2.0, 2.0], [3, 3, 3])
+    mesh = fem.box([2.0, 2.0, 2.0], [3, 3, 3])
     rails = [
-        DirichletBC(Plane(axis, "min"), [0.0 if k == axis else None for k in range(3)])
+        fem.DirichletBC(fem.Plane(axis, "min"), [0.0 if k == axis else None for k in range(3)])
         for axis in range(3)
     ]
-    pulled = DirichletBC(RIGHT, [1.0, None, None])
-    for law, lateral in ((SaintVenantKirchhoff(0.3), 0.79056942), (NH, 0.88017459)):
-        problem = Problem.build(mesh, law, supports=[*rails, pulled])
+    pulled = fem.DirichletBC(RIGHT, [1.0, None, None])
+    for law, lateral in ((fem.SaintVenantKirchhoff(0.3), 0.79056942), (NH, 0.88017459)):
+        problem = fem.Problem.build(mesh, law, supports=[*rails, pulled])
         answer = answer_of(problem, tol=1e-12)
         assert answer.converged.all()
         end = 1 + answer.displacement[0, problem.points.sum(dim=1).argmax()]
@@ -174,9 +162,9 @@ def test_moved_supports_stretch_the_body():
 
 def test_supports_move_with_the_load():
     """An equilibrium under half the load has half the displacement at the supports."""
-    mesh = rectangle([4.0, 1.0], [9, 3])
-    ends = [DirichletBC(LEFT), DirichletBC(RIGHT, [4.0, 1.0])]
-    problem = Problem.build(mesh, NH, supports=ends)
+    mesh = fem.rectangle([4.0, 1.0], [9, 3])
+    ends = [fem.DirichletBC(LEFT), fem.DirichletBC(RIGHT, [4.0, 1.0])]
+    problem = fem.Problem.build(mesh, NH, supports=ends)
     right = problem.points[:, 0] > 1 - 1e-9
     for budget, factor in ((10, 0.5), (30, 1.0)):  # three iterations are too few for the whole
         answer = answer_of(problem, max_iter=3, max_total_iter=budget, mixed_integration=False)
@@ -192,22 +180,22 @@ def test_supports_move_with_the_load():
 STRETCH, START, END = 1.0880339146912892, 0.2, 0.5521356587651567
 
 
-def bar(kind, count: int, stiffness) -> Problem:
+def bar(kind, count: int, stiffness) -> fem.Problem:
     """Return the bar on an elastic foundation, in 3D or 2D."""
     cell, degree = kind
     dim = 3 if cell in ("tetra", "hexahedron") else 2
-    build = box if dim == 3 else rectangle
+    build = fem.box if dim == 3 else fem.rectangle
     mesh = build([4.0, *[1.0] * (dim - 1)], [count + 1, *[2] * (dim - 1)], cell)
     shift = np.random.default_rng(0).uniform(-0.1, 0.1, mesh.p.shape) / count
     shift[:, mesh.boundary_nodes()] = 0.0
     shift[0, (mesh.p[0] > 0) & (mesh.p[0] < 4)] = 0.3 / count  # cells of two lengths
     mesh = type(mesh)(mesh.p + shift, mesh.t)
-    law = SaintVenantKirchhoff(0.0)
-    return Problem.build(mesh, law, supports=[RobinBC(LEFT, stiffness)], degree=degree)
+    law = fem.SaintVenantKirchhoff(0.0)
+    return fem.Problem.build(mesh, law, supports=[fem.RobinBC(LEFT, stiffness)], degree=degree)
 
 
-def check_bar(problem: Problem) -> None:
-    force = Traction(RIGHT, [0.1, *[0.0] * (problem.shape[1] - 1)]).on(problem)
+def check_bar(problem: fem.Problem) -> None:
+    force = fem.Traction(RIGHT, [0.1, *[0.0] * (problem.shape[1] - 1)]).on(problem)
     answer = answer_of(problem, force, tol=1e-13)
     assert answer.converged.all()
     x, u = problem.points[:, 0] * problem.length, answer.displacement[0] * problem.length
@@ -234,8 +222,8 @@ def test_bar_on_springs_does_not_depend_on_the_unit_of_length(kind):
     """A bar of 0.004 m with alpha / E = 500/m and a displacement in metres."""
     problem = bar(kind, 3, 0.5)
     mesh = problem.mesh.scaled(0.004)
-    small = Problem.build(
-        mesh, problem.material, supports=[RobinBC(LEFT, 500.0)], degree=problem.degree
+    small = fem.Problem.build(
+        mesh, problem.material, supports=[fem.RobinBC(LEFT, 500.0)], degree=problem.degree
     )
     assert small.length == pytest.approx(0.004)
     assert_close(small.springs.stiffness, problem.springs.stiffness, rtol=1e-12, atol=1e-15)
@@ -274,10 +262,13 @@ def test_unconstrained_rigid_body_modes_on_springs_are_the_zero_modes(kind, dim)
 
 def test_springs_and_clamps_hold_together(held, dim):
     """A hinge line or point leaves rotations; springs at the other end take them."""
-    corner = Box([0.0] * dim, [0.0] * dim)
-    pinned = held(DirichletBC(corner))
+    corner = fem.Box([0.0] * dim, [0.0] * dim)
+    pinned = held(fem.DirichletBC(corner))
     assert len(pinned.unconstrained_rigid_body_modes()) == {2: 1, 3: 3}[dim]
-    assert held(DirichletBC(corner), RobinBC(RIGHT, 1e-3)).unconstrained_rigid_body_modes() == []
+    assert (
+        held(fem.DirichletBC(corner), fem.RobinBC(RIGHT, 1e-3)).unconstrained_rigid_body_modes()
+        == []
+    )
 
 
 def test_soft_springs_hold_as_well_as_stiff_ones(kind):
@@ -286,12 +277,12 @@ def test_soft_springs_hold_as_well_as_stiff_ones(kind):
 
 
 @pytest.fixture
-def sprung(held, dim) -> Problem:
+def sprung(held, dim) -> fem.Problem:
     """Unequal cells, held in part, two beds of springs on neighbouring faces."""
     return held(
-        DirichletBC(Box([0.0] * dim, [4.0, *[0.0] * (dim - 1)]), [None, 0.0, None][:dim]),
-        RobinBC(LEFT, [0.3, 0.1, 0.7][:dim]),
-        RobinBC(Plane(1, "max"), 0.2),
+        fem.DirichletBC(fem.Box([0.0] * dim, [4.0, *[0.0] * (dim - 1)]), [None, 0.0, None][:dim]),
+        fem.RobinBC(LEFT, [0.3, 0.1, 0.7][:dim]),
+        fem.RobinBC(fem.Plane(1, "max"), 0.2),
     )
 
 
@@ -323,7 +314,7 @@ def test_mixed_system_contains_the_springs(sprung, bend):
 def test_force_of_springs_is_stiffness_times_displacement_times_area(held, dim):
     """A body moved as a whole: the pull is -alpha u, on an area of 4 m by 4 m."""
     stiffness = np.array([0.3, 0.1, 0.7][:dim])
-    problem = held(RobinBC(LEFT, stiffness.tolist()))
+    problem = held(fem.RobinBC(LEFT, stiffness.tolist()))
     shift = torch.tensor([0.05, -0.02, 0.01][:dim], dtype=torch.float64)
     u = shift.expand(1, *problem.shape)
     total = problem.internal_force(u).sum(dim=1)[0]
@@ -333,33 +324,33 @@ def test_force_of_springs_is_stiffness_times_displacement_times_area(held, dim):
 
 
 def test_foundations_on_one_face_add_up(held, bend):
-    one, two = held(RobinBC(LEFT, 0.3), RobinBC(LEFT, 0.2)), held(RobinBC(LEFT, 0.5))
+    one, two = held(fem.RobinBC(LEFT, 0.3), fem.RobinBC(LEFT, 0.2)), held(fem.RobinBC(LEFT, 0.5))
     u = bend(one.points)
     assert_close(one.internal_force(u), two.internal_force(u), rtol=1e-12, atol=1e-15)
     assert_close(one.tangent(u), two.tangent(u), rtol=1e-12, atol=1e-15)
 
 
 def test_body_without_springs_has_none(held):
-    assert held(DirichletBC(LEFT)).springs is None
+    assert held(fem.DirichletBC(LEFT)).springs is None
 
 
 def test_very_stiff_springs_act_as_a_clamp(kind):
     """The difference falls with the stiffness, by 10 where it is ten times as large."""
     cell, degree = kind
-    build = box if cell in ("tetra", "hexahedron") else rectangle
-    dim = 3 if build is box else 2
+    build = fem.box if cell in ("tetra", "hexahedron") else fem.rectangle
+    dim = 3 if build is fem.box else 2
     mesh = build([4.0, *[1.0] * (dim - 1)], [5, *[2] * (dim - 1)], cell)
-    law, value = LinearElastic(0.3), [0.0, 1e-4, 0.0][:dim]
+    law, value = fem.LinearElastic(0.3), [0.0, 1e-4, 0.0][:dim]
 
     def sag(**supports):
-        problem = Problem.build(mesh, law, degree=degree, **supports)
-        force = Traction(RIGHT, value).on(problem)
+        problem = fem.Problem.build(mesh, law, degree=degree, **supports)
+        force = fem.Traction(RIGHT, value).on(problem)
         answer = answer_of(problem, force)
         assert answer.converged.all()
         return (answer.displacement[0] * force).sum().item()
 
     clamped = sag(fixed=LEFT)
-    softer, stiffer = (sag(supports=[RobinBC(LEFT, a)]) / clamped - 1 for a in (1e3, 1e4))
+    softer, stiffer = (sag(supports=[fem.RobinBC(LEFT, a)]) / clamped - 1 for a in (1e3, 1e4))
     assert 0 < stiffer < 1e-2
     assert softer / stiffer == pytest.approx(10, rel=0.05)
 

@@ -5,21 +5,7 @@ import pickle
 import pytest
 import torch
 
-from dpl.fem import (
-    DifferentiableSolve,
-    DirichletBC,
-    LinearElastic,
-    Load,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    RobinBC,
-    SingularMatrix,
-    Status,
-    box,
-    solve,
-)
+from dpl import fem
 from dpl.fem.linear import SuperLU
 
 YOUNG, LENGTH = 4500.0, 100.0
@@ -27,12 +13,12 @@ YOUNG, LENGTH = 4500.0, 100.0
 
 @pytest.fixture(scope="module")
 def problem(beam):
-    return beam(NeoHookeanLn(0.3), n=4, m=1)
+    return beam(fem.NeoHookeanLn(0.3), n=4, m=1)
 
 
 @pytest.fixture(scope="module")
 def equilibrium(problem):
-    return DifferentiableSolve(Newton(problem, tol=1e-12, linear="superlu"))
+    return fem.DifferentiableSolve(fem.Newton(problem, tol=1e-12, linear="superlu"))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +38,7 @@ def noise(*shape, seed=0):
 
 
 def loaded(force):
-    return Load(force, torch.ones(len(force), dtype=torch.float64))
+    return fem.Load(force, torch.ones(len(force), dtype=torch.float64))
 
 
 def seen(displacement):
@@ -67,7 +53,7 @@ def slope_of(function, step):
 
 def test_the_solution_is_that_of_newton(equilibrium, force):
     answer = equilibrium(loaded(force))
-    assert torch.equal(answer, solve(equilibrium.newton, loaded(force)).displacement)
+    assert torch.equal(answer, fem.solve(equilibrium.newton, loaded(force)).displacement)
     assert answer.dtype == torch.float64
     assert not answer.requires_grad
 
@@ -95,7 +81,7 @@ def test_forces_on_fixed_nodes_have_no_gradient(problem, equilibrium, force):
 
 def test_the_gradient_by_young_and_force_is_the_difference_quotient(scene, batch):
     """Through `Scene.load_of`: u/L depends on f/(E L^2) alone, so f df + E dE = 0 as well."""
-    equilibrium = DifferentiableSolve(Newton(scene.problem, tol=1e-12, linear="superlu"))
+    equilibrium = fem.DifferentiableSolve(fem.Newton(scene.problem, tol=1e-12, linear="superlu"))
     young = torch.tensor([4500.0, 9000.0], dtype=torch.float64)
     newtons = batch.force[:2] * (young * scene.force_unit)[:, None, None]
 
@@ -131,8 +117,8 @@ def test_repeated_gradients_take_one_factorisation(equilibrium, force, monkeypat
 
 
 def test_linear_bodies_have_the_same_gradient_everywhere(beam, pull):
-    problem = beam(LinearElastic(0.3), n=4, m=1)
-    equilibrium = DifferentiableSolve(Newton(problem, linear="superlu"))
+    problem = beam(fem.LinearElastic(0.3), n=4, m=1)
+    equilibrium = fem.DifferentiableSolve(fem.Newton(problem, linear="superlu"))
     force = torch.cat([pull(problem, 0.01), pull(problem, 1.0)]).requires_grad_()
     weight = noise(*problem.shape)
     (slope,) = torch.autograd.grad((equilibrium(loaded(force)) * weight).sum(), force)
@@ -143,12 +129,14 @@ def test_linear_bodies_have_the_same_gradient_everywhere(beam, pull):
 
 def test_moved_supports_and_springs_are_included(pull):
     ends = [
-        DirichletBC(Plane(0, "max"), [5.0, None, None]),
-        RobinBC(Plane(2, "min"), 1e-4),
+        fem.DirichletBC(fem.Plane(0, "max"), [5.0, None, None]),
+        fem.RobinBC(fem.Plane(2, "min"), 1e-4),
     ]
-    mesh = box([LENGTH, 25.0, 25.0], [5, 2, 2])
-    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), supports=ends)
-    equilibrium = DifferentiableSolve(Newton(problem, tol=1e-12, linear="superlu"))
+    mesh = fem.box([LENGTH, 25.0, 25.0], [5, 2, 2])
+    problem = fem.Problem.build(
+        mesh, fem.NeoHookeanLn(0.3), fixed=fem.Plane(0, "min"), supports=ends
+    )
+    equilibrium = fem.DifferentiableSolve(fem.Newton(problem, tol=1e-12, linear="superlu"))
     force, way = pull(problem, 5.0), noise(1, *problem.shape, seed=3)
     inner = force.clone().requires_grad_()
     answer = equilibrium(loaded(inner))
@@ -161,8 +149,8 @@ def test_moved_supports_and_springs_are_included(pull):
 
 def test_an_unstable_column_has_a_gradient(beam):
     """The tangent is indefinite and not singular."""
-    problem = beam(NeoHookeanLn(0.3), n=8, m=1)
-    equilibrium = DifferentiableSolve(Newton(problem, tol=1e-12, linear="superlu"))
+    problem = beam(fem.NeoHookeanLn(0.3), n=8, m=1)
+    equilibrium = fem.DifferentiableSolve(fem.Newton(problem, tol=1e-12, linear="superlu"))
     tip = (problem.points[:, 0] == problem.points[:, 0].max()).double()
     axial = torch.zeros(1, *problem.shape, dtype=torch.float64)
     axial[0, :, 0] = -tip / tip.sum()
@@ -172,7 +160,7 @@ def test_an_unstable_column_has_a_gradient(beam):
 
     load = torch.tensor(0.006, dtype=torch.float64, requires_grad=True)
     answer = equilibrium.solution(loaded(load.detach() * axial))
-    assert answer.status.tolist() == [Status.UNSTABLE]
+    assert answer.status.tolist() == [fem.Status.UNSTABLE]
     assert int(answer.negative_pivots) > 0
     (slope,) = torch.autograd.grad(shortened(load), load)
     with torch.no_grad():
@@ -195,7 +183,7 @@ def test_a_guess_saves_iterations_and_changes_neither_solution_nor_gradient(equi
 
 
 def test_error_names_the_loads_without_a_solution(problem, force):
-    equilibrium = DifferentiableSolve(Newton(problem, linear="superlu", max_total_iter=2))
+    equilibrium = fem.DifferentiableSolve(fem.Newton(problem, linear="superlu", max_total_iter=2))
     too_large = torch.cat([0 * force[:1], 100 * force[1:]]).requires_grad_()
     with pytest.raises(ValueError, match="of 2 loads, load 1: not converged"):
         equilibrium(loaded(too_large))
@@ -204,11 +192,11 @@ def test_error_names_the_loads_without_a_solution(problem, force):
 
 def test_a_critical_load_has_no_gradient(equilibrium, force, monkeypatch):
     def critical(backend, values):
-        raise SingularMatrix("a pivot is zero")
+        raise fem.SingularMatrix("a pivot is zero")
 
     answer = equilibrium(loaded(force.clone().requires_grad_()))
     monkeypatch.setattr(SuperLU, "factorise", critical)
-    with pytest.raises(SingularMatrix):
+    with pytest.raises(fem.SingularMatrix):
         answer.sum().backward()
 
 

@@ -11,47 +11,32 @@ import pytest
 import torch
 from torch import Tensor
 
-from dpl.fem import (
-    Load,
-    Material,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    SingularMatrix,
-    Solution,
-    Status,
-    Traction,
-    box,
-    installed_backends,
-    solve,
-)
+from dpl import fem
 from dpl.fem.linear import BandedCholesky, Pardiso, SuperLU, multigrid_installed
 from dpl.fem.linear.interface import UNKNOWN, UNSTABLE, Stability
 from dpl.fem.linear.superlu import SuperLUFactor
 from dpl.fem.solvers import factor_reuse as reuse_module
 from dpl.fem.solvers.factor_reuse import Preconditioner, select_preconditioner
 
-NH, SVK = NeoHookeanLn(0.3), SaintVenantKirchhoff(0.3)
+NH, SVK = fem.NeoHookeanLn(0.3), fem.SaintVenantKirchhoff(0.3)
 
 
-def load_of(*forces: Tensor) -> Load:
+def load_of(*forces: Tensor) -> fem.Load:
     """Return nodal forces (N, D) [-] as a batch of loads."""
-    return Load(torch.stack(forces), torch.ones(len(forces), dtype=torch.float64))
+    return fem.Load(torch.stack(forces), torch.ones(len(forces), dtype=torch.float64))
 
 
-def pair(problem: Problem, load: Load, guess: Tensor | None = None, **options):
+def pair(problem: fem.Problem, load: fem.Load, guess: Tensor | None = None, **options):
     """Return the solutions without and with factor reuse."""
     answers = []
-    for reuse in (0.0, Newton(problem).factor_reuse_tol):
-        solver = Newton(problem, **{"linear": "superlu", "factor_reuse_tol": reuse, **options})
+    for reuse in (0.0, fem.Newton(problem).factor_reuse_tol):
+        solver = fem.Newton(problem, **{"linear": "superlu", "factor_reuse_tol": reuse, **options})
         *_, last = solver.iterate(load, guess=guess)
         answers.append(last)
     return answers
 
 
-def check(every: Solution, few: Solution, *, steps: int = 1, fewer: bool = True) -> None:
+def check(every: fem.Solution, few: fem.Solution, *, steps: int = 1, fewer: bool = True) -> None:
     """Assert that two solutions are equal and that the second took less work.
 
     Args:
@@ -90,14 +75,14 @@ def test_solution_of_any_law_does_not_depend_on_reuse(beam, pull, any_law, mixed
 @pytest.mark.parametrize("size", [0.01, 0.1])
 def test_solution_on_any_element_does_not_depend_on_reuse(grid, cell, degree, size):
     mesh = grid(cell, 3, 0.2, inside=True)
-    problem = Problem.build(mesh, NH, fixed=Plane(0, "min"), degree=degree)
+    problem = fem.Problem.build(mesh, NH, fixed=fem.Plane(0, "min"), degree=degree)
     across = [0.0] * (mesh.dim() - 1) + [size]
-    every, few = pair(problem, load_of(Traction(Plane(0, "max"), across).on(problem)))
+    every, few = pair(problem, load_of(fem.Traction(fem.Plane(0, "max"), across).on(problem)))
     assert every.converged.all()
     check(every, few)
 
 
-@pytest.mark.parametrize("name", installed_backends())
+@pytest.mark.parametrize("name", fem.installed_backends())
 @pytest.mark.parametrize(("cells", "q"), [((8, 2), 5.0), ((8, 2), 160.0), ((16, 4), 40.0)])
 def test_solution_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cells, q):
     problem = beam(NH, *cells)
@@ -111,9 +96,9 @@ def test_large_load_that_takes_steps_does_not_depend_on_reuse(beam, pull, mixed,
     problem = beam(NH)
     load = load_of(pull(problem, q)[0])
     states = list(
-        Newton(problem, linear="superlu", mixed_integration=mixed, factor_reuse_tol=0.0).iterate(
-            load
-        )
+        fem.Newton(
+            problem, linear="superlu", mixed_integration=mixed, factor_reuse_tol=0.0
+        ).iterate(load)
     )
     steps = 1 + len({state.load_factor.item() for state in states})
     every, few = pair(problem, load, mixed_integration=mixed)
@@ -126,19 +111,19 @@ def test_load_without_a_solution_has_none_with_reuse(beam, pull, mixed, q):
     problem = beam(SVK)
     options = {"min_load_step": 2.0**-6, "mixed_integration": mixed}
     every, few = pair(problem, load_of(pull(problem, q)[0]), **options)
-    assert every.status.item() == few.status.item() == Status.NO_VALID_EQUILIBRIUM
+    assert every.status.item() == few.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
     assert 0 < few.load_factor.item() < 1
     assert few.load_factor.item() == pytest.approx(every.load_factor.item(), abs=1e-9)
     assert torch.allclose(few.displacement, every.displacement, rtol=0, atol=1e-2)
 
 
 def test_moved_supports_are_followed_with_reuse(law, mixed):
-    mesh = box([1.0, 1.0, 1.0], [4, 4, 4])
+    mesh = fem.box([1.0, 1.0, 1.0], [4, 4, 4])
     held = mesh.p.T == 0
     held[:, 0] |= mesh.p[0] == 1
     given = np.where(mesh.p[0] == 1, 0.5, 0.0)[:, None] * np.array([1, 0, 0])
-    problem = Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0)
-    sideways = Traction(Plane(2, "max"), [0.0, 0.0, 0.01]).on(problem)
+    problem = fem.Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0)
+    sideways = fem.Traction(fem.Plane(2, "max"), [0.0, 0.0, 0.01]).on(problem)
     for force in (torch.zeros_like(sideways), sideways):
         every, few = pair(problem, load_of(force), mixed_integration=mixed)
         assert every.converged.all()
@@ -149,8 +134,8 @@ def test_moved_supports_are_followed_with_reuse(law, mixed):
 def test_guess_leads_to_the_same_solution_with_reuse(beam, pull, law, part):
     problem = beam(law)
     load = load_of(pull(problem, 20.0)[0])
-    answer = solve(
-        Newton(problem, tol=1e-12, linear="superlu", factor_reuse_tol=0.0), load
+    answer = fem.solve(
+        fem.Newton(problem, tol=1e-12, linear="superlu", factor_reuse_tol=0.0), load
     ).displacement
     every, few = pair(problem, load, guess=part * answer)
     assert every.converged.all()
@@ -163,7 +148,7 @@ def test_more_reuse_means_fewer_factors(beam, pull, reuse):
     problem = beam(NH, 16, 4)
     load = load_of(pull(problem, 20.0)[0])
     counts = {0.0: 4, 1e-3: 3, 0.1: 2, 1.0: 2, 1e6: 1}
-    answer = solve(Newton(problem, linear="superlu", factor_reuse_tol=reuse), load)
+    answer = fem.solve(fem.Newton(problem, linear="superlu", factor_reuse_tol=reuse), load)
     assert answer.converged.all()
     assert answer.iterations.item() == 5
     assert answer.factorisations.item() == counts[reuse]
@@ -172,10 +157,10 @@ def test_more_reuse_means_fewer_factors(beam, pull, reuse):
 @pytest.mark.parametrize("q", [5.0, 40.0, 160.0])
 def test_factorisations_are_counted(beam, pull, counted, q):
     problem = beam(NH)
-    solver, load = Newton(problem, linear="superlu"), load_of(pull(problem, q)[0])
+    solver, load = fem.Newton(problem, linear="superlu"), load_of(pull(problem, q)[0])
     solver.linear_solver.factor  # noqa: B018  the scene's
     counted.clear()
-    answer = solve(solver, load)
+    answer = fem.solve(solver, load)
     assert 0 < answer.factorisations.item() == len(counted)
     assert answer.factorisations.item() < answer.iterations.item() - 1
 
@@ -184,8 +169,8 @@ def test_without_reuse_every_tangent_is_factorised(beam, pull, monkeypatch):
     """No factor is used as a preconditioner."""
     problem = beam(NH)
     monkeypatch.setattr(SuperLUFactor, "apply", None)
-    answer = solve(
-        Newton(problem, linear="superlu", factor_reuse_tol=0.0), load_of(pull(problem, 40.0)[0])
+    answer = fem.solve(
+        fem.Newton(problem, linear="superlu", factor_reuse_tol=0.0), load_of(pull(problem, 40.0)[0])
     )
     assert answer.converged.all()
     assert answer.factorisations.item() == answer.iterations.item() - 1
@@ -194,7 +179,7 @@ def test_without_reuse_every_tangent_is_factorised(beam, pull, monkeypatch):
 @pytest.mark.parametrize("reuse", [0.01, 0.1, 0.5])
 def test_factors_are_reused_only_below_factor_reuse_tol(beam, pull, reuse):
     problem = beam(NH)
-    solver = Newton(problem, linear="superlu", factor_reuse_tol=reuse)
+    solver = fem.Newton(problem, linear="superlu", factor_reuse_tol=reuse)
     made, before = [], 1.0
     for state in solver.iterate(load_of(pull(problem, 80.0)[0])):
         made.append((before, state.factorisations.item()))
@@ -220,7 +205,7 @@ def test_poor_preconditioner_is_replaced_after_the_largest_number_of_steps(
         return original(product, lambda r: r, right, rtol, max_iter)
 
     monkeypatch.setattr(reuse_module, "conjugate_gradients", poor_preconditioner)
-    answer = solve(Newton(problem, linear="superlu"), load)
+    answer = fem.solve(fem.Newton(problem, linear="superlu"), load)
     assert answer.converged.all()
     assert answer.iterations.item() == every.iterations.item()
     assert answer.factorisations.item() == every.factorisations.item() > few.factorisations.item()
@@ -234,10 +219,10 @@ def test_factor_that_cannot_be_applied_is_replaced(beam, pull, monkeypatch):
     every, _ = pair(problem, load)
 
     def fail(self, right):
-        raise SingularMatrix("gone")
+        raise fem.SingularMatrix("gone")
 
     monkeypatch.setattr(SuperLUFactor, "apply", fail)
-    answer = solve(Newton(problem, linear="superlu"), load)
+    answer = fem.solve(fem.Newton(problem, linear="superlu"), load)
     assert torch.equal(answer.displacement, every.displacement)
     assert answer.factorisations.item() == every.factorisations.item()
 
@@ -245,16 +230,16 @@ def test_factor_that_cannot_be_applied_is_replaced(beam, pull, monkeypatch):
 def test_batch_with_reuse_solves_like_its_members(beam, pull):
     problem = beam(NH)
     load = load_of(*(pull(problem, q)[0] for q in (0.0, 1e-6, 5.0, 40.0, 160.0)))
-    solver = Newton(problem, linear="superlu")
-    batch = solve(solver, load)
+    solver = fem.Newton(problem, linear="superlu")
+    batch = fem.solve(solver, load)
     for k, force in enumerate(load.force):
-        alone = solve(solver, load_of(force))
+        alone = fem.solve(solver, load_of(force))
         for name in ("displacement", "iterations", "factorisations", "status"):
             assert torch.equal(getattr(batch, name)[k], getattr(alone, name)[0]), name
     assert len(set(batch.factorisations.tolist())) > 2
 
 
-@pytest.mark.skipif("pardiso" not in installed_backends(), reason="pardiso is not installed")
+@pytest.mark.skipif("pardiso" not in fem.installed_backends(), reason="pardiso is not installed")
 def test_factorisations_of_a_batch_are_all_counted(beam, pull, monkeypatch):
     calls, original = [], Pardiso._factorise
 
@@ -264,10 +249,10 @@ def test_factorisations_of_a_batch_are_all_counted(beam, pull, monkeypatch):
 
     problem = beam(NH)
     load = load_of(*(pull(problem, q)[0] for q in (5.0, 10.0, 20.0, 40.0)))
-    solver = Newton(problem, linear="pardiso")
+    solver = fem.Newton(problem, linear="pardiso")
     solver.linear_solver.factor  # noqa: B018
     monkeypatch.setattr(Pardiso, "_factorise", count)
-    assert int(solve(solver, load).factorisations.sum()) == len(calls)
+    assert int(fem.solve(solver, load).factorisations.sum()) == len(calls)
 
 
 @pytest.mark.parametrize("reuse", [0.0, 0.1])
@@ -280,10 +265,10 @@ def test_the_next_factor_takes_the_storage_of_an_unused_one(beam, pull, monkeypa
         places.append(self._storage.ctypes.data)
         return factor
 
-    solver = Newton(problem, linear="band", factor_reuse_tol=reuse)
+    solver = fem.Newton(problem, linear="band", factor_reuse_tol=reuse)
     solver.linear_solver.factor  # noqa: B018
     monkeypatch.setattr(BandedCholesky, "_cholesky", watched)
-    answer = solve(solver, load_of(pull(problem, 40.0)[0]))
+    answer = fem.solve(solver, load_of(pull(problem, 40.0)[0]))
     assert answer.factorisations.item() == len(places) >= 3
     assert len(set(places)) == 1
 
@@ -292,31 +277,31 @@ def test_the_next_factor_takes_the_storage_of_an_unused_one(beam, pull, monkeypa
 
 
 @cache
-def column(law: Material) -> tuple[Problem, Tensor]:
+def column(law: fem.Material) -> tuple[fem.Problem, Tensor]:
     """Return a column of 10 x 1 x 1 m, E = 1000 Pa, and the axial load P = 1."""
-    mesh = box([10.0, 1.0, 1.0], [11, 2, 2])
-    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=2)
-    return problem, Traction(Plane(0, "max"), [-1 / 1000, 0.0, 0.0]).on(problem)
+    mesh = fem.box([10.0, 1.0, 1.0], [11, 2, 2])
+    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=2)
+    return problem, fem.Traction(fem.Plane(0, "max"), [-1 / 1000, 0.0, 0.0]).on(problem)
 
 
 @cache
-def cube(poisson: float) -> tuple[Problem, Tensor]:
+def cube(poisson: float) -> tuple[fem.Problem, Tensor]:
     """Return the cube of Rivlin (1948) on three symmetry planes, and T = 1 on the other faces."""
-    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
-    problem = Problem.build(mesh, NeoHookeanLn(poisson), fixed=mesh.p.T == 0, length=1.0)
+    mesh = fem.box([1.0, 1.0, 1.0], [2, 2, 2])
+    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(poisson), fixed=mesh.p.T == 0, length=1.0)
     normals = torch.eye(3).tolist()
-    return problem, sum(Traction(Plane(i, "max"), normals[i]).on(problem) for i in range(3))
+    return problem, sum(fem.Traction(fem.Plane(i, "max"), normals[i]).on(problem) for i in range(3))
 
 
-def negative(problem: Problem, displacement: Tensor) -> int:
+def negative(problem: fem.Problem, displacement: Tensor) -> int:
     """Return the number of negative eigenvalues of K at a displacement (1, N, D)."""
     tangent = problem.linearise(displacement).tangent[0].numpy()
     return SuperLU(problem.pattern).factorise(tangent).negative_pivots
 
 
 BODIES = {  # body with its unit load, critical load (independent code)
-    "SVK column": (partial(column, SaintVenantKirchhoff(0.0)), 2.039763),
-    "NH column": (partial(column, NeoHookeanLn(0.0)), 2.056558),
+    "SVK column": (partial(column, fem.SaintVenantKirchhoff(0.0)), 2.039763),
+    "NH column": (partial(column, fem.NeoHookeanLn(0.0)), 2.056558),
     "cube, nu = .45": (partial(cube, 0.45), 0.7475041023),
     "cube, nu = .49": (partial(cube, 0.49), 0.6804639956),
 }
@@ -332,17 +317,17 @@ BEYOND = (1.0005, 1.001, 1.002, 1.01, 1.05)
 )
 def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, linear, reuse):
     """The column, and the cube of Rivlin (1948)."""
-    if linear not in installed_backends():
+    if linear not in fem.installed_backends():
         pytest.skip(f"{linear} is not installed")
     (build, critical), options = (
         BODIES[name],
         {"tol": 1e-10, "linear": linear, "factor_reuse_tol": reuse},
     )
     problem, unit = build()
-    answer = solve(Newton(problem, **options), load_of(part * critical * unit))
+    answer = fem.solve(fem.Newton(problem, **options), load_of(part * critical * unit))
     assert answer.converged.all()
     assert negative(problem, answer.displacement) == 2
-    assert answer.status.item() == Status.UNSTABLE
+    assert answer.status.item() == fem.Status.UNSTABLE
     assert answer.negative_pivots.item() == 2
 
 
@@ -354,7 +339,7 @@ def test_load_below_a_critical_one_is_stable_whatever_is_reused(name, part):
     problem, unit = build()
     every, few = pair(problem, load_of(part * critical * unit), tol=1e-10)
     assert negative(problem, few.displacement) == 0
-    assert few.status.item() == Status.CONVERGED
+    assert few.status.item() == fem.Status.CONVERGED
     check(every, few, fewer=False)
 
 
@@ -362,7 +347,7 @@ def test_load_below_a_critical_one_is_stable_whatever_is_reused(name, part):
 @pytest.mark.parametrize("linear", ["superlu", "band"])
 def test_factor_with_negative_pivots_is_never_reused(monkeypatch, P, linear):
     """Conjugate gradients need a positive definite preconditioner."""
-    problem, unit = column(SaintVenantKirchhoff(0.0))
+    problem, unit = column(fem.SaintVenantKirchhoff(0.0))
     used, met, original = [], [], SuperLU.factorise
 
     def watched(self, values):
@@ -375,18 +360,18 @@ def test_factor_with_negative_pivots_is_never_reused(monkeypatch, P, linear):
     monkeypatch.setattr(
         SuperLUFactor, "apply", lambda self, r: used.append(self.negative_pivots) or self.solve(r)
     )
-    solver = Newton(problem, tol=1e-10, linear=linear, factor_reuse_tol=1e6)
-    answer = solve(solver, load_of(P * unit))
-    assert answer.status.item() == Status.UNSTABLE
+    solver = fem.Newton(problem, tol=1e-10, linear=linear, factor_reuse_tol=1e6)
+    answer = fem.solve(solver, load_of(P * unit))
+    assert answer.status.item() == fem.Status.UNSTABLE
     assert [count for count in met if count > 0][:2] == [2, 2]
     assert not any(used)
 
 
 def test_straight_column_far_beyond_is_the_same_with_and_without_reuse():
-    problem, unit = column(SaintVenantKirchhoff(0.0))
+    problem, unit = column(fem.SaintVenantKirchhoff(0.0))
     for P in (2.1, 2.5, 4.0):
         every, few = pair(problem, load_of(P * unit), tol=1e-10)
-        assert few.status.item() == every.status.item() == Status.UNSTABLE
+        assert few.status.item() == every.status.item() == fem.Status.UNSTABLE
         assert few.negative_pivots.item() == every.negative_pivots.item()
         check(every, few, fewer=False)
 
@@ -428,10 +413,10 @@ def test_stability_is_encoded_as_in_the_solution():
 @pytest.mark.parametrize("reuse", [-0.1, -1e-300, math.nan, math.inf])
 def test_reuse_out_of_range_is_refused_by_name(beam, reuse):
     with pytest.raises(ValueError, match=f"factor_reuse_tol = {reuse} must be 0 or more"):
-        Newton(beam(NH, 4, 1), factor_reuse_tol=reuse)
+        fem.Newton(beam(NH, 4, 1), factor_reuse_tol=reuse)
 
 
 def test_reuse_survives_pickling_and_replacing(beam):
-    solver = Newton(beam(NH, 4, 1), factor_reuse_tol=0.25)
+    solver = fem.Newton(beam(NH, 4, 1), factor_reuse_tol=0.25)
     assert pickle.loads(pickle.dumps(solver)).factor_reuse_tol == 0.25
     assert replace(solver, mixed_integration=False).factor_reuse_tol == 0.25

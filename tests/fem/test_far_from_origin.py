@@ -10,30 +10,11 @@ import skfem
 import torch
 from torch.testing import assert_close
 
-from dpl.fem import (
-    BodyForce,
-    Box,
-    Cylinder,
-    DirichletBC,
-    LinearSolver,
-    Load,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    RobinBC,
-    Sphere,
-    Traction,
-    box,
-    eigenmodes,
-    propeller,
-    solve,
-    symmetries,
-)
+from dpl import fem
 from dpl.fem.loads import body_force, traction
 from dpl.fem.mesh import check_mesh
 
-NH, EPS = NeoHookeanLn(0.3), np.finfo(float).eps
+NH, EPS = fem.NeoHookeanLn(0.3), np.finfo(float).eps
 CELLS = 3  # along the sides of the grids
 DISTANCES = [0.0, 1e3, 1e6]
 
@@ -57,12 +38,12 @@ def distance(request) -> float:
 def test_a_body_about_the_origin_is_not_moved(beam):
     problem = beam(NH)
     assert not problem.origin.any()
-    assert np.array_equal(problem.mesh.p, box([100.0, 25.0, 25.0], [9, 3, 3]).p / 100.0)
+    assert np.array_equal(problem.mesh.p, fem.box([100.0, 25.0, 25.0], [9, 3, 3]).p / 100.0)
 
 
 def test_a_far_body_is_written_at_its_coordinates(kind, grid, distance):
     mesh = away(grid(kind[0], CELLS, 0.15), distance)
-    problem = Problem.build(mesh, NH, degree=kind[1])
+    problem = fem.Problem.build(mesh, NH, degree=kind[1])
     assert np.abs(problem.points.numpy()).max() < 3
     assert problem.mesh_in_metres.p == pytest.approx(mesh.p, abs=2 * EPS * max(distance, 1))
 
@@ -70,7 +51,7 @@ def test_a_far_body_is_written_at_its_coordinates(kind, grid, distance):
 def test_far_elements_pass_the_patch_test_as_near_ones_do(kind, grid, distance):
     """The geometry is that of the rounded coordinates: inner nodes are in balance to rounding."""
     mesh = away(grid(kind[0], CELLS, 0.15), distance)
-    problem = Problem.build(check_mesh(mesh), NH, degree=kind[1], length=1.0)
+    problem = fem.Problem.build(check_mesh(mesh), NH, degree=kind[1], length=1.0)
     dim = problem.shape[1]
     H = torch.tensor([[0.02, 0.05, -0.01], [0.03, -0.04, 0.02], [-0.02, 0.01, 0.03]]).double()
     field = (problem.points @ H[:dim, :dim].T)[None]
@@ -83,10 +64,12 @@ def test_loads_and_springs_on_a_far_body_are_those_on_a_near_one(kind, grid, dis
     values = []
     for d in (0.0, distance):
         mesh = away(grid(kind[0], CELLS, 0.15, inside=True), d)
-        problem = Problem.build(mesh, NH, degree=kind[1], supports=[RobinBC(Plane(0, "min"), 0.3)])
+        problem = fem.Problem.build(
+            mesh, NH, degree=kind[1], supports=[fem.RobinBC(fem.Plane(0, "min"), 0.3)]
+        )
         dim = problem.shape[1]
-        stress = Traction(Plane(0, "max"), [0.3, -2.0, 0.7][:dim]).on(problem)
-        values.append((stress, BodyForce([0.3, -2.0, 0.7][:dim]).on(problem)))
+        stress = fem.Traction(fem.Plane(0, "max"), [0.3, -2.0, 0.7][:dim]).on(problem)
+        values.append((stress, fem.BodyForce([0.3, -2.0, 0.7][:dim]).on(problem)))
         pull = problem.springs.force(torch.ones(1, *problem.shape, dtype=torch.float64))
         values[-1] += (pull,)
     for near, far in zip(*values, strict=True):
@@ -95,7 +78,7 @@ def test_loads_and_springs_on_a_far_body_are_those_on_a_near_one(kind, grid, dis
 
 def test_fields_of_loads_receive_the_coordinates_of_the_user(grid, distance):
     mesh = away(grid("hexahedron", CELLS), distance)
-    problem = Problem.build(mesh, NH, length=1.0)
+    problem = fem.Problem.build(mesh, NH, length=1.0)
     low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
 
     def seen(x):
@@ -104,22 +87,22 @@ def test_fields_of_loads_receive_the_coordinates_of_the_user(grid, distance):
         return np.zeros_like(x)
 
     body_force(problem, seen)
-    traction(problem, Plane(0, "max"), seen)
+    traction(problem, fem.Plane(0, "max"), seen)
 
 
 def test_regions_in_absolute_coordinates_hold_the_same_nodes(distance):
     """The corners of a box, a ball and a cylinder lie on nodes, where rounding decides."""
-    near = box([4.0, 1.0, 1.0], [9, 5, 5])
+    near = fem.box([4.0, 1.0, 1.0], [9, 5, 5])
     mesh = away(near, 4 * distance)
     shift = mesh.p[:, 0] - near.p[:, 0]
     for region in (
-        lambda at: Plane(0, at[0] + 0.5),
-        lambda at: Box(at, at + np.array([1.0, 0.5, 1.0])),
-        lambda at: Sphere(at, 0.5),
-        lambda at: Cylinder(0, 0.25, at),
+        lambda at: fem.Plane(0, at[0] + 0.5),
+        lambda at: fem.Box(at, at + np.array([1.0, 0.5, 1.0])),
+        lambda at: fem.Sphere(at, 0.5),
+        lambda at: fem.Cylinder(0, 0.25, at),
     ):
         held = [
-            ~Problem.build(m, NH, supports=[DirichletBC(region(at))]).free
+            ~fem.Problem.build(m, NH, supports=[fem.DirichletBC(region(at))]).free
             for m, at in ((near, np.zeros(3)), (mesh, shift))
         ]
         assert held[0].any()
@@ -127,17 +110,21 @@ def test_regions_in_absolute_coordinates_hold_the_same_nodes(distance):
 
 
 def test_a_cylinder_selects_a_far_bore(distance):
-    mesh = away(propeller(), distance)
+    mesh = away(fem.propeller(), distance)
     centre = distance * np.array([1.0, -0.7, 0.9])
-    problem = Problem.build(mesh, NH, fixed=Cylinder(0, 0.05, centre))
+    problem = fem.Problem.build(mesh, NH, fixed=fem.Cylinder(0, 0.05, centre))
     assert (~problem.free).sum() == 525
 
 
 def test_modes_of_a_far_body_are_those_of_a_near_one(distance):
     found = []
     for d in (0.0, distance):
-        mesh = away(box([4.0, 1.1, 1.0], [9, 3, 3]), 4 * d)
-        found.append(eigenmodes(LinearSolver(Problem.build(mesh, NH, fixed=Plane(0, "min"))), 4))
+        mesh = away(fem.box([4.0, 1.1, 1.0], [9, 3, 3]), 4 * d)
+        found.append(
+            fem.eigenmodes(
+                fem.LinearSolver(fem.Problem.build(mesh, NH, fixed=fem.Plane(0, "min"))), 4
+            )
+        )
     near, far = found
     allowed = tolerance(distance, 8)
     assert far.values.numpy() == pytest.approx(near.values.numpy(), rel=allowed)
@@ -150,10 +137,10 @@ def test_a_far_beam_bends_as_a_near_one(distance):
     """The traction on its end raised an error of Newton's method inside scikit-fem."""
     answers = []
     for d in (0.0, distance):
-        mesh = away(box([100.0, 25.0, 25.0], [9, 3, 3]), 100 * d)
-        problem = Problem.build(mesh, NH, fixed=Plane(0, "min"))
-        force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
-        answer = solve(Newton(problem, tol=1e-10), Load(force[None], torch.ones(1)))
+        mesh = away(fem.box([100.0, 25.0, 25.0], [9, 3, 3]), 100 * d)
+        problem = fem.Problem.build(mesh, NH, fixed=fem.Plane(0, "min"))
+        force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
+        answer = fem.solve(fem.Newton(problem, tol=1e-10), fem.Load(force[None], torch.ones(1)))
         assert answer.converged.all()
         answers.append(answer.displacement)
     near, far = answers
@@ -161,5 +148,7 @@ def test_a_far_beam_bends_as_a_near_one(distance):
 
 
 def test_a_body_a_thousand_lengths_away_keeps_its_symmetries():
-    problem = Problem.build(away(box([4.0, 1.0, 1.0], [5, 3, 3]), 4e3), NH, fixed=Plane(0, "min"))
-    assert len(symmetries(problem)) == 8
+    problem = fem.Problem.build(
+        away(fem.box([4.0, 1.0, 1.0], [5, 3, 3]), 4e3), NH, fixed=fem.Plane(0, "min")
+    )
+    assert len(fem.symmetries(problem)) == 8

@@ -7,26 +7,16 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem import (
-    BodyForce,
-    LinearElastic,
-    LinearSolver,
-    NeoHookeanLn,
-    Plane,
-    Problem,
-    Traction,
-    box,
-    rectangle,
-)
+from dpl import fem
 from dpl.fem.loads import body_force, traction
 
 
 @pytest.fixture(params=[1.0, 4.0])
-def body(request, kind, grid) -> Problem:
+def body(request, kind, grid) -> fem.Problem:
     """A unit body of each kind of element, shaken inside, in units of a length."""
     cell, degree = kind
     mesh = grid(cell, 3, 0.15, inside=True)
-    return Problem.build(mesh, NeoHookeanLn(0.3), degree=degree, length=request.param)
+    return fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), degree=degree, length=request.param)
 
 
 def constant(vector):
@@ -34,7 +24,7 @@ def constant(vector):
     return lambda x: np.multiply.outer(np.asarray(vector, float), np.ones(x.shape[1:]))
 
 
-def moments(problem: Problem, force: torch.Tensor) -> torch.Tensor:
+def moments(problem: fem.Problem, force: torch.Tensor) -> torch.Tensor:
     """Return the dipole sum of x_i f_j, (D, D)."""
     return problem.points.T @ force
 
@@ -42,7 +32,7 @@ def moments(problem: Problem, force: torch.Tensor) -> torch.Tensor:
 def test_constant_traction_adds_up_to_stress_times_area(body):
     dim, side = body.shape[1], 1 / body.length
     stress = np.array([0.3, -2.0, 0.7])[:dim]
-    force = traction(body, Plane(0, "max"), constant(stress))
+    force = traction(body, fem.Plane(0, "max"), constant(stress))
     area = side ** (dim - 1)
     assert_close(force.sum(dim=0), torch.from_numpy(stress * area), rtol=1e-12, atol=1e-14)
     assert force[body.points[:, 0] < side - 1e-9].abs().max() < 1e-15
@@ -51,7 +41,7 @@ def test_constant_traction_adds_up_to_stress_times_area(body):
 def test_constant_traction_acts_at_the_middle_of_its_face(body):
     dim, side = body.shape[1], 1 / body.length
     stress = np.array([0.3, -2.0, 0.7])[:dim]
-    force = traction(body, Plane(0, "max"), constant(stress))
+    force = traction(body, fem.Plane(0, "max"), constant(stress))
     middle = np.array([side, side / 2, side / 2])[:dim]
     expected = torch.from_numpy(np.outer(middle, stress) * side ** (dim - 1))
     assert_close(moments(body, force), expected, rtol=1e-12, atol=1e-14)
@@ -64,7 +54,7 @@ def test_linear_traction_adds_up_to_its_integral(body):
     def stress(x):
         return np.stack([x[1], *[0 * x[1]] * (dim - 1)])
 
-    force = traction(body, Plane(0, "min"), stress).sum(dim=0)
+    force = traction(body, fem.Plane(0, "min"), stress).sum(dim=0)
     assert force[0].item() == pytest.approx(side**2 / 2 * side ** (dim - 2), rel=1e-12)
     assert not force[1:].any()
 
@@ -75,7 +65,7 @@ def test_pressure_all_around_is_in_balance(body):
     total = torch.zeros(body.shape, dtype=torch.float64)
     for axis in range(dim):
         for end, sign in (("min", -1.0), ("max", 1.0)):
-            total += traction(body, Plane(axis, end), constant(sign * np.eye(dim)[axis]))
+            total += traction(body, fem.Plane(axis, end), constant(sign * np.eye(dim)[axis]))
     assert total.sum(dim=0).abs().max() < 1e-13
     volume = side**dim
     expected = volume * torch.eye(dim, dtype=torch.float64)
@@ -93,7 +83,7 @@ def test_constant_body_force_adds_up_to_density_times_volume(body):
 def test_weight_acts_at_the_centre_of_gravity(kind, grid):
     """Exact where the quadrature integrates x N: all elements but the triangles of degree 1."""
     cell, degree = kind
-    problem = Problem.build(grid(cell, 3), NeoHookeanLn(0.3), degree=degree, length=1.0)
+    problem = fem.Problem.build(grid(cell, 3), fem.NeoHookeanLn(0.3), degree=degree, length=1.0)
     dim = problem.shape[1]
     density = np.arange(1.0, dim + 1)
     expected = torch.from_numpy(np.outer(np.full(dim, 0.5), density))
@@ -104,7 +94,7 @@ def test_weight_acts_at_the_centre_of_gravity(kind, grid):
 def test_body_force_is_evaluated_where_it_acts(kind, grid):
     """The total of the density (x, 0, 0) over a unit body is 1/2."""
     cell, degree = kind
-    problem = Problem.build(grid(cell, 3), NeoHookeanLn(0.3), degree=degree, length=1.0)
+    problem = fem.Problem.build(grid(cell, 3), fem.NeoHookeanLn(0.3), degree=degree, length=1.0)
 
     def density(x):
         return np.stack([x[0], *[0 * x[0]] * (len(x) - 1)])
@@ -115,7 +105,7 @@ def test_body_force_is_evaluated_where_it_acts(kind, grid):
 
 
 def test_empty_region_of_a_traction_is_an_error(body):
-    for region in (Plane(0, 0.4321 / body.length), lambda points: np.zeros(len(points), bool)):
+    for region in (fem.Plane(0, 0.4321 / body.length), lambda points: np.zeros(len(points), bool)):
         with pytest.raises(ValueError, match="no facet of the boundary"):
             traction(body, region, constant(np.zeros(body.shape[1])))
 
@@ -129,10 +119,10 @@ def test_single_node_is_no_facet(body):
 
 
 @pytest.fixture(params=[0.5, 3.0])
-def sized(request, kind, grid) -> Problem:
+def sized(request, kind, grid) -> fem.Problem:
     """A body of each kind of element with sides of so many metres, lengths over that."""
     mesh = grid(kind[0], 3, 0.15, inside=True).scaled(request.param)
-    problem = Problem.build(mesh, NeoHookeanLn(0.3), degree=kind[1])
+    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), degree=kind[1])
     assert problem.length == pytest.approx(request.param)
     return problem
 
@@ -140,7 +130,7 @@ def sized(request, kind, grid) -> Problem:
 def test_traction_is_a_stress_over_young(sized):
     """Force over E L^2 of the value on a face of side L: the value itself, whatever L."""
     value = [0.3, -2.0, 0.7][: sized.shape[1]]
-    force = Traction(Plane(0, "max"), value).on(sized)
+    force = fem.Traction(fem.Plane(0, "max"), value).on(sized)
     assert force.sum(dim=0).tolist() == pytest.approx(value, rel=1e-12)
     assert force[sized.points[:, 0] < 1 - 1e-9].abs().max() < 1e-15
 
@@ -148,31 +138,31 @@ def test_traction_is_a_stress_over_young(sized):
 def test_body_force_is_a_weight_per_volume_over_young(sized):
     """Force over E L^2 of a density [1/m] on a volume L^3: the value times L."""
     value = [0.3, -2.0, 0.7][: sized.shape[1]]
-    force = BodyForce(value).on(sized)
+    force = fem.BodyForce(value).on(sized)
     expected = [sized.length * density for density in value]
     assert force.sum(dim=0).tolist() == pytest.approx(expected, rel=1e-12)
 
 
 def test_region_of_a_traction_is_in_metres(sized):
     far = sized.length
-    force = Traction(Plane(1, far), [1.0] * sized.shape[1]).on(sized)
+    force = fem.Traction(fem.Plane(1, far), [1.0] * sized.shape[1]).on(sized)
     assert force.sum(dim=0).tolist() == pytest.approx([1.0] * sized.shape[1], rel=1e-12)
     with pytest.raises(ValueError, match="no facet of the boundary"):
-        Traction(Plane(1, 1.234 * far), [1.0] * sized.shape[1]).on(sized)
+        fem.Traction(fem.Plane(1, 1.234 * far), [1.0] * sized.shape[1]).on(sized)
 
 
 @pytest.mark.parametrize("value", [[], [1.0], [1.0] * 4, [1.0, math.nan, 0.0], [math.inf] * 3])
 def test_load_of_the_wrong_length_is_an_error(grid, value):
-    problem = Problem.build(grid("hexahedron"), NeoHookeanLn(0.3))
-    for load in (Traction(Plane(0, "max"), value), BodyForce(value)):
+    problem = fem.Problem.build(grid("hexahedron"), fem.NeoHookeanLn(0.3))
+    for load in (fem.Traction(fem.Plane(0, "max"), value), fem.BodyForce(value)):
         with pytest.raises(ValueError, match="must be 3 finite numbers"):
             load.on(problem)
 
 
 def test_load_for_space_is_an_error_in_the_plane(grid):
-    problem = Problem.build(grid("quad"), NeoHookeanLn(0.3))
+    problem = fem.Problem.build(grid("quad"), fem.NeoHookeanLn(0.3))
     with pytest.raises(ValueError, match="must be 2 finite numbers"):
-        BodyForce([0.0, 0.0, -1.0]).on(problem)
+        fem.BodyForce([0.0, 0.0, -1.0]).on(problem)
 
 
 def test_bar_hanging_in_its_own_weight_stretches_quadratically(kind):
@@ -181,11 +171,13 @@ def test_bar_hanging_in_its_own_weight_stretches_quadratically(kind):
     if degree == 1 and cell in ("triangle", "tetra"):
         pytest.skip("cells that are no bars")
     dim = 3 if cell in ("tetra", "hexahedron") else 2
-    build = box if dim == 3 else rectangle
+    build = fem.box if dim == 3 else fem.rectangle
     mesh = build([4.0, *[1.0] * (dim - 1)], [5, *[2] * (dim - 1)], cell)
-    problem = Problem.build(mesh, LinearElastic(0.0), fixed=Plane(0, "min"), degree=degree)
-    force = BodyForce([1e-3, *[0.0] * (dim - 1)]).on(problem)
-    u = LinearSolver(problem, linear="superlu").solve(force) * problem.length
+    problem = fem.Problem.build(
+        mesh, fem.LinearElastic(0.0), fixed=fem.Plane(0, "min"), degree=degree
+    )
+    force = fem.BodyForce([1e-3, *[0.0] * (dim - 1)]).on(problem)
+    u = fem.LinearSolver(problem, linear="superlu").solve(force) * problem.length
     x = problem.points[:, 0] * problem.length
     expected = 1e-3 * x * (8 - x) / 2
     assert_close(u[:, 0], expected, rtol=0, atol=1e-13)

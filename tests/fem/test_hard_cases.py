@@ -22,26 +22,11 @@ from benchmarks.stress.fixtures import (
     underconstrained_bar,
 )
 from benchmarks.stress.invalid_input import EMPTY_REGIONS, REGION_USES
-from dpl.fem import (
-    LinearSolver,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Solution,
-    Status,
-    Traction,
-    box,
-    eigenmodes,
-    evaluate_solution,
-    installed_backends,
-    solve,
-)
+from dpl import fem
 from dpl.fem.mesh import check_mesh
 
-SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
-DIRECT = [name for name in installed_backends() if name != "cg"]
+SVK, NH = fem.SaintVenantKirchhoff(0.3), fem.NeoHookeanLn(0.3)
+DIRECT = [name for name in fem.installed_backends() if name != "cg"]
 
 
 @pytest.fixture(params=[False, True], ids=["plain", "mixed"])
@@ -65,10 +50,10 @@ def test_large_load_that_has_an_answer_gets_it(beam, pull, mixed, case):
     """Stress cases T1, T3, T4: whole, uninverted on the way, stable; hex8 16 x 4 x 4."""
     law, q, deepest, volume = ANSWERED[case]
     problem = beam(law, 16, 4)
-    for state in Newton(problem, mixed_integration=mixed).iterate(as_load(pull(problem, q)[0])):
+    for state in fem.Newton(problem, mixed_integration=mixed).iterate(as_load(pull(problem, q)[0])):
         assert state.volume_ratio.item() > 0
         assert 0 <= state.load_factor.item() <= 1
-    assert state.status.item() == Status.CONVERGED
+    assert state.status.item() == fem.Status.CONVERGED
     assert state.negative_pivots.item() == 0
     assert state.load_factor.item() == 1
     assert state.volume_ratio.item() == pytest.approx(volume, abs=5.1e-4)
@@ -78,12 +63,12 @@ def test_large_load_that_has_an_answer_gets_it(beam, pull, mixed, case):
 
 def test_slender_beam_takes_steps_where_one_does_not_do(mixed):
     """Stress case T5: NH-ln 20 x 1 x 1, nu = 0, P L^2 / EI = 1: w / L = .302130893."""
-    law = NeoHookeanLn(0.0)
-    mesh = box([20.0, 1.0, 1.0], [21, 2, 2])
-    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=2)
-    force = Traction(Plane(0, "max"), [0.0, 0.0, -1 / 12 / 400]).on(problem)
-    states = list(Newton(problem, mixed_integration=mixed).iterate(as_load(force)))
-    assert states[-1].status.item() == Status.CONVERGED
+    law = fem.NeoHookeanLn(0.0)
+    mesh = fem.box([20.0, 1.0, 1.0], [21, 2, 2])
+    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=2)
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -1 / 12 / 400]).on(problem)
+    states = list(fem.Newton(problem, mixed_integration=mixed).iterate(as_load(force)))
+    assert states[-1].status.item() == fem.Status.CONVERGED
     mean = force[:, 2] @ states[-1].displacement[0, :, 2] / force[:, 2].sum()
     assert -mean.item() == pytest.approx(0.302130893, abs=5.1e-10)
     stepped = any(0 < state.load_factor.item() < 1 for state in states)
@@ -98,16 +83,16 @@ def test_load_beyond_all_answers_is_refused_with_the_part_that_has_one(beam, pul
     """Stress case T2: no inverted state passes, and none is stored as an answer."""
     problem = beam(SVK, 16, 4)
     force = pull(problem, q)[0]
-    solver = Newton(problem, mixed_integration=mixed)
+    solver = fem.Newton(problem, mixed_integration=mixed)
     for state in solver.iterate(as_load(force)):
         assert state.volume_ratio.item() > 0
         assert not state.converged.any()
-    assert state.status.item() == Status.NO_VALID_EQUILIBRIUM
+    assert state.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
     assert not state.stable.any()
-    assert str(Status(state.status.item())) == "no valid equilibrium"
+    assert str(fem.Status(state.status.item())) == "no valid equilibrium"
     assert state.residual.item() > solver.tol
     assert 130 < q * state.load_factor.item() < q
-    part = evaluate_solution(
+    part = fem.evaluate_solution(
         problem, state.displacement, as_load(state.load_factor * force), solver.intermediate_tol
     )
     assert part.converged.all()
@@ -120,8 +105,8 @@ def test_tiny_load_of_isotropic_laws_ends_at_the_linear_answer(
     """Stress case T6: u / q within 1e-6 of the linear one; no law stalls above 1e-8."""
     problem = beam(isotropic_law)
     load = as_load(pull(problem, q)[0])
-    answer, linear = (solve(kind(problem), load) for kind in (Newton, LinearSolver))
-    assert answer.status.item() == Status.CONVERGED
+    answer, linear = (fem.solve(kind(problem), load) for kind in (fem.Newton, fem.LinearSolver))
+    assert answer.status.item() == fem.Status.CONVERGED
     assert answer.iterations.item() <= 3
     assert answer.residual.item() < 1e-8
     ratio = corner(problem, answer.displacement)[2] / corner(problem, linear.displacement)[2]
@@ -133,8 +118,8 @@ def test_tiny_load_of_isotropic_laws_ends_at_the_linear_answer(
 def test_tiny_load_of_fibres_without_compression_converges(beam, pull, laws, name, q):
     """Fibres that are shortened do not resist, so that the solution is not the linear one."""
     problem = beam(laws[name])
-    answer = solve(Newton(problem), as_load(pull(problem, q)[0]))
-    assert answer.status.item() == Status.CONVERGED
+    answer = fem.solve(fem.Newton(problem), as_load(pull(problem, q)[0]))
+    assert answer.status.item() == fem.Status.CONVERGED
     assert answer.iterations.item() <= 6
     assert answer.residual.item() < 1e-8
 
@@ -142,8 +127,10 @@ def test_tiny_load_of_fibres_without_compression_converges(beam, pull, laws, nam
 def test_no_load_at_all_is_answered_by_rest(beam, any_law):
     """Stress case T6: the zero load takes 0 iterations."""
     problem = beam(any_law)
-    answer = solve(Newton(problem), as_load(torch.zeros(problem.shape, dtype=torch.float64)))
-    assert answer.status.item() == Status.CONVERGED
+    answer = fem.solve(
+        fem.Newton(problem), as_load(torch.zeros(problem.shape, dtype=torch.float64))
+    )
+    assert answer.status.item() == fem.Status.CONVERGED
     assert answer.iterations.item() == 0
     assert not answer.displacement.any()
 
@@ -171,9 +158,13 @@ def compliance(beam, pull):
     @cache
     def compliance(nu: float, cell: str, degree: int, cells: tuple[int, int], mean: bool = False):
         options = {"cell": cell, "degree": degree, "mean_dilatation": mean}
-        problem = beam(NeoHookeanLn(nu), *cells, **options)
+        problem = beam(fem.NeoHookeanLn(nu), *cells, **options)
         force = pull(problem, 1e-3)
-        return (force * solve(LinearSolver(problem), as_load(force[0])).displacement).sum().item()
+        return (
+            (force * fem.solve(fem.LinearSolver(problem), as_load(force[0])).displacement)
+            .sum()
+            .item()
+        )
 
     return compliance
 
@@ -203,7 +194,7 @@ def test_linear_elements_near_incompressibility_are_warned_of(grid, cell, nu):
     """Stress case T8: with the remedies that the shape has."""
     remedy = "set degree=2$" if cell in ("triangle", "tetra") else "or mean_dilatation=true$"
     with pytest.warns(UserWarning, match=f"lock at Poisson's ratio {nu}: .*{remedy}"):
-        Problem.build(grid(cell), NeoHookeanLn(nu))
+        fem.Problem.build(grid(cell), fem.NeoHookeanLn(nu))
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
@@ -211,10 +202,10 @@ def test_elements_that_do_not_lock_are_not_warned_of(grid, cell):
     """Stress case T8."""
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always", UserWarning)
-        Problem.build(grid(cell), NeoHookeanLn(0.449))
-        Problem.build(grid(cell), NeoHookeanLn(0.4999), degree=2)
+        fem.Problem.build(grid(cell), fem.NeoHookeanLn(0.449))
+        fem.Problem.build(grid(cell), fem.NeoHookeanLn(0.4999), degree=2)
         if cell in ("quad", "hexahedron"):
-            Problem.build(grid(cell), NeoHookeanLn(0.4999), mean_dilatation=True)
+            fem.Problem.build(grid(cell), fem.NeoHookeanLn(0.4999), mean_dilatation=True)
     assert [str(one.message) for one in seen] == []
 
 
@@ -230,7 +221,7 @@ PLATES = {
 def deflection(sides: int, layers: int, degree: int, slenderness: int) -> float:
     """Return the deflection of a clamped square plate over Kirchhoff's, under an even load."""
     problem, force, known = plate(sides, layers, degree, slenderness)
-    answer = solve(LinearSolver(problem), as_load(force))
+    answer = fem.solve(fem.LinearSolver(problem), as_load(force))
     below = nearest_node(problem, [0.5, 0.5, 0.0])
     return -answer.displacement[0, below, 2].item() / known
 
@@ -246,11 +237,11 @@ def test_plate_bends_as_tabulated(cells, case):
 @pytest.mark.parametrize(("slenderness", "warned"), [(100, False), (330, True)])
 def test_flat_linear_cells_are_warned_of(slenderness, warned):
     """Stress case T10: aspect ratio above 20; those of degree 2 are not."""
-    mesh = box([1.0, 1.0, 1 / slenderness], [17, 17, 2])
+    mesh = fem.box([1.0, 1.0, 1 / slenderness], [17, 17, 2])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        Problem.build(mesh, NH, degree=2)
-        Problem.build(mesh, NH)
+        fem.Problem.build(mesh, NH, degree=2)
+        fem.Problem.build(mesh, NH)
     lines = [str(w.message) for w in caught if w.category is UserWarning]
     expected = "linear hexahedral elements of aspect ratio 21 lock in bending: set degree=2"
     assert lines == ([expected] if warned else [])
@@ -265,11 +256,11 @@ SLIVERS = {1e-2: -0.2388289, 1e-4: -0.2386176, 1e-6: -0.2386155, 1e-8: -0.238615
 def test_slivers_are_warned_of_and_change_nothing(pull, name, mixed, part):
     """Stress case T11: the plane x = 50 of the beam moved to 37.5 + 12.5 eps."""
     with pytest.warns(UserWarning, match="aspect ratio .* lock in bending"):
-        problem = Problem.build(sliver_mesh(part), SVK, fixed=Plane(0, "min"))
-    answer = solve(
-        Newton(problem, linear=name, mixed_integration=mixed), as_load(pull(problem, 20.0)[0])
+        problem = fem.Problem.build(sliver_mesh(part), SVK, fixed=fem.Plane(0, "min"))
+    answer = fem.solve(
+        fem.Newton(problem, linear=name, mixed_integration=mixed), as_load(pull(problem, 20.0)[0])
     )
-    assert answer.status.item() == Status.CONVERGED
+    assert answer.status.item() == fem.Status.CONVERGED
     assert answer.load_factor.item() == 1
     assert answer.iterations.item() <= 6
     end = answer.displacement[0, problem.points.sum(dim=1).argmax(), 2].item()
@@ -287,20 +278,20 @@ def test_body_folded_at_rest_is_refused_by_the_numbers_of_its_cells():
 @pytest.mark.parametrize("support", UNDERCONSTRAINED)
 def test_loose_body_is_refused_by_its_motions(support):
     """Stress case T13: before any factorisation."""
-    linear = LinearSolver(underconstrained_bar(support))
+    linear = fem.LinearSolver(underconstrained_bar(support))
     with pytest.raises(ValueError, match=UNDERCONSTRAINED[support][1]):
-        eigenmodes(linear, 3)
+        fem.eigenmodes(linear, 3)
     assert "factor" not in linear.__dict__
 
 
 @pytest.mark.parametrize("support", UNDERCONSTRAINED)
-@pytest.mark.parametrize("name", installed_backends())
+@pytest.mark.parametrize("name", fem.installed_backends())
 def test_loose_body_never_moves_far(support, name):
     """Stress case T13: Newton does not take the rounding of a zero pivot for an answer."""
     problem = underconstrained_bar(support)
-    force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
-    answer = solve(Newton(problem, linear=name), as_load(force))
-    assert answer.status.item() >= Status.NO_VALID_EQUILIBRIUM
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
+    answer = fem.solve(fem.Newton(problem, linear=name), as_load(force))
+    assert answer.status.item() >= fem.Status.NO_VALID_EQUILIBRIUM
     assert answer.load_factor.item() == 0
     assert not answer.displacement.any()
 
@@ -317,9 +308,11 @@ def test_region_without_a_node_is_an_error_and_not_an_absent_load(grid, use, whe
 @pytest.mark.parametrize("name", DIRECT)
 def test_column_beyond_buckling_is_in_balance_and_flagged(mixed, name):
     """Stress cases T17 and T22: two negative pivots, whichever backend meets them; not stored."""
-    problem, force = column(SaintVenantKirchhoff(0.0), (10, 1, 1))
-    answer = solve(Newton(problem, mixed_integration=mixed, linear=name), as_load(2.5 * force))
-    assert answer.status.item() == Status.UNSTABLE
+    problem, force = column(fem.SaintVenantKirchhoff(0.0), (10, 1, 1))
+    answer = fem.solve(
+        fem.Newton(problem, mixed_integration=mixed, linear=name), as_load(2.5 * force)
+    )
+    assert answer.status.item() == fem.Status.UNSTABLE
     assert answer.negative_pivots.item() == 2
     assert answer.converged.all()
     assert not answer.stable.any()
@@ -329,11 +322,11 @@ def test_column_beyond_buckling_is_in_balance_and_flagged(mixed, name):
 
 
 @pytest.mark.parametrize("P", [2.0397, 2.039763, 2.0398, 2.5])
-@pytest.mark.parametrize("name", installed_backends())
+@pytest.mark.parametrize("name", fem.installed_backends())
 def test_singular_tangent_ends_in_words_and_not_in_nan(name, P):
     """Stress case T22: at the critical load 2.039763 and about it, with any backend."""
-    problem, force = column(SaintVenantKirchhoff(0.0), (10, 1, 1))
-    for state in Newton(problem, linear=name).iterate(as_load(P * force)):
+    problem, force = column(fem.SaintVenantKirchhoff(0.0), (10, 1, 1))
+    for state in fem.Newton(problem, linear=name).iterate(as_load(P * force)):
         assert check_sane(state)
     if P > 2.04:
         assert not state.stable.any()
@@ -341,10 +334,10 @@ def test_singular_tangent_ends_in_words_and_not_in_nan(name, P):
         assert state.converged.all()
         assert state.displacement[..., 1:].abs().max() < 1e-6
     else:  # conjugate gradients want a positive definite tangent
-        assert state.converged.all() or state.status.item() == Status.NO_VALID_EQUILIBRIUM
+        assert state.converged.all() or state.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
 
 
-def check_sane(state: Solution) -> bool:
+def check_sane(state: fem.Solution) -> bool:
     """Return whether all that is said of a state is finite and in range."""
     finite = all(value.isfinite().all() for value in state)
     factor, volume = state.load_factor.item(), state.volume_ratio.item()

@@ -9,23 +9,7 @@ import skfem
 import torch
 from torch import Tensor
 
-from dpl.fem import (
-    LinearElastic,
-    LinearSolver,
-    Load,
-    Material,
-    MooneyRivlinK2,
-    NeoHookeanIsoK2,
-    NeoHookeanIsoK4,
-    NeoHookeanLn,
-    Newton,
-    Problem,
-    Solution,
-    StableNeoHookean,
-    Status,
-    YeohK2,
-    solve,
-)
+from dpl import fem
 from dpl.fem.loads import traction
 
 
@@ -44,33 +28,33 @@ def formulation(request) -> dict:
     return FORMULATIONS[request.param]
 
 
-def without_load(problem: Problem, guess: Tensor | None = None, **options) -> Solution:
+def without_load(problem: fem.Problem, guess: Tensor | None = None, **options) -> fem.Solution:
     """Return the answer (N, D) to the supports alone."""
     none = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    load = Load(none, torch.ones(1, dtype=torch.float64))
-    *_, last = Newton(problem, **options).iterate(load, guess=guess)
+    load = fem.Load(none, torch.ones(1, dtype=torch.float64))
+    *_, last = fem.Newton(problem, **options).iterate(load, guess=guess)
     return last
 
 
-def slopes(law: Material) -> Callable[[float, float], tuple[float, float]]:
+def slopes(law: fem.Material) -> Callable[[float, float], tuple[float, float]]:
     """Return dW/dI1 and dW/dI2 at J = 1 as functions of I1 and I2."""
-    if isinstance(law, MooneyRivlinK2):
+    if isinstance(law, fem.MooneyRivlinK2):
         return lambda i1, i2: (law.c10, law.c01)
-    if isinstance(law, YeohK2):
+    if isinstance(law, fem.YeohK2):
         return lambda i1, i2: (law.c10 + 2 * law.c20 * (i1 - 3) + 3 * law.c30 * (i1 - 3) ** 2, 0.0)
     mu = float(law.mu)
-    if isinstance(law, StableNeoHookean):  # m/2 (I1 - 3) - m/2 ln(I1 + 1), m = 4 mu/3
+    if isinstance(law, fem.StableNeoHookean):  # m/2 (I1 - 3) - m/2 ln(I1 + 1), m = 4 mu/3
         return lambda i1, i2: (2 / 3 * mu * (1 - 1 / (i1 + 1)), 0.0)
     return lambda i1, i2: (mu / 2, 0.0)
 
 
 RUBBERS = {
-    "NH-ln": NeoHookeanLn(NU),
-    "NHiso-k2": NeoHookeanIsoK2(NU),
-    "NHiso-k4": NeoHookeanIsoK4(NU),
-    "SNH": StableNeoHookean(NU),
-    "MR": MooneyRivlinK2(0.15, 0.05, 4e4),
-    "Yeoh": YeohK2(0.2, -0.02, 0.005, 4e4),
+    "NH-ln": fem.NeoHookeanLn(NU),
+    "NHiso-k2": fem.NeoHookeanIsoK2(NU),
+    "NHiso-k4": fem.NeoHookeanIsoK4(NU),
+    "SNH": fem.StableNeoHookean(NU),
+    "MR": fem.MooneyRivlinK2(0.15, 0.05, 4e4),
+    "Yeoh": fem.YeohK2(0.2, -0.02, 0.005, 4e4),
 }
 EXTRA = {"NHiso-k2", "NHiso-k4", "SNH"}  # for which, but for one mode, there is little time
 MODES = {  # stretch -> principal stretches, the directions that are pulled, P11 of W1 and W2
@@ -93,13 +77,15 @@ def test_stretched_rubber_has_the_stress_of_the_incompressible_limit(formulation
     law = RUBBERS[name]
     stretches, pulled, factors = MODES[mode]
     mesh = grid("hexahedron", 2, 0.2, inside=True)
-    points = Problem.build(mesh, law, length=1.0, **formulation).points.numpy()
+    points = fem.Problem.build(mesh, law, length=1.0, **formulation).points.numpy()
     far, held = points > 1 - 1e-9, points < 1e-9
     held[:, :pulled] |= far[:, :pulled]
     for stretch in (0.7, 2.0):
         principal = np.array(stretches(stretch))
         given = np.where(far, principal - 1, 0.0)
-        problem = Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0, **formulation)
+        problem = fem.Problem.build(
+            mesh, law, fixed=held, prescribed=given, length=1.0, **formulation
+        )
         guess = problem.points * torch.from_numpy(principal - 1)
         answer = without_load(problem, guess[None])
         assert answer.converged.all()
@@ -126,14 +112,16 @@ def octant(cells: int, layers: int, inner: float, outer: float) -> skfem.MeshHex
     return skfem.MeshHex2(radius * direction / np.linalg.norm(direction, axis=0), flat.t)
 
 
-def blown_up(mesh: skfem.MeshHex2, law: Material, stretch: float) -> tuple[Problem, Solution]:
+def blown_up(
+    mesh: skfem.MeshHex2, law: fem.Material, stretch: float
+) -> tuple[fem.Problem, fem.Solution]:
     """Return an eighth of a sphere whose inner radius 1 has grown, and its answer."""
-    points = Problem.build(mesh, law, length=1.0).points
+    points = fem.Problem.build(mesh, law, length=1.0).points
     radius = points.norm(dim=1)
     inside = radius < 1 + 1e-9
     held = (points < 1e-9) | inside[:, None]
     given = torch.where(inside[:, None], (stretch - 1) * points, 0.0)
-    problem = Problem.build(
+    problem = fem.Problem.build(
         mesh, law, fixed=held.numpy(), prescribed=given.numpy(), degree=2, length=1.0
     )
     grown = (radius**3 + stretch**3 - 1) ** (1 / 3)  # as an incompressible body does
@@ -141,7 +129,7 @@ def blown_up(mesh: skfem.MeshHex2, law: Material, stretch: float) -> tuple[Probl
     return problem, without_load(problem, guess)
 
 
-def pressure_inside(problem: Problem, answer: Solution, stretch: float) -> float:
+def pressure_inside(problem: fem.Problem, answer: fem.Solution, stretch: float) -> float:
     """Return the pressure in the hole of an octant: work per change of its volume.
 
     The hole is blown up by its displacement: so the pressure, which in nature follows the surface
@@ -158,9 +146,9 @@ SPHERES = [(1.1, 0.2871548459), (1.5, 0.7554331187), (2.0, 0.8069266031), (3.0, 
 @pytest.mark.parametrize(("stretch", "printed"), SPHERES)
 def test_thick_sphere_has_the_inner_pressure_of_the_closed_form(stretch, printed):
     """The pressure is mu (f(b) - f(a)) / 2, f = s^-4 + 4 / s, s the stretches at radii 1 and 2."""
-    law = NeoHookeanIsoK2(poisson(1e4))
+    law = fem.NeoHookeanIsoK2(poisson(1e4))
     problem, answer = blown_up(octant(2, 32, 1.0, 2.0), law, stretch)
-    assert answer.status.item() == Status.CONVERGED
+    assert answer.status.item() == fem.Status.CONVERGED
     pressure = pressure_inside(problem, answer, stretch)
     assert pressure / law.mu == pytest.approx(printed, rel=1e-3)
 
@@ -168,7 +156,7 @@ def test_thick_sphere_has_the_inner_pressure_of_the_closed_form(stretch, printed
 @pytest.mark.filterwarnings("ignore:.*rounding allows no less")
 def test_balloon_has_its_largest_pressure_at_the_sixth_root_of_seven():
     """Thin neo-Hookean sphere: p R / (2 mu H) = 1 / s - 1 / s^7; here H / R = 1e-3."""
-    law, peak = NeoHookeanIsoK2(poisson(1e4)), 7 ** (1 / 6)
+    law, peak = fem.NeoHookeanIsoK2(poisson(1e4)), 7 ** (1 / 6)
     mesh, found = octant(4, 1, 1.0, 1.001), {}
     for stretch in (0.97 * peak, peak, 1.03 * peak):
         problem, answer = blown_up(mesh, law, stretch)
@@ -186,7 +174,7 @@ def bore(nu: float, cells: tuple[int, int], **options) -> float:
 
     It is the linear solution: mean dilatation is for laws of finite strain, whose K(0) is Hooke's.
     """
-    law = NeoHookeanLn(nu) if options.get("mean_dilatation") else LinearElastic(nu)
+    law = fem.NeoHookeanLn(nu) if options.get("mean_dilatation") else fem.LinearElastic(nu)
     polar = skfem.MeshQuad.init_tensor(
         np.linspace(3, 9, cells[0] + 1), np.linspace(0, np.pi / 2, cells[1] + 1)
     )
@@ -194,15 +182,15 @@ def bore(nu: float, cells: tuple[int, int], **options) -> float:
         polar = skfem.MeshQuad2.from_mesh(polar)
     radius, angle = polar.doflocs
     mesh = type(polar)(np.stack([radius * np.cos(angle), radius * np.sin(angle)]), polar.t)
-    points = Problem.build(mesh, law, length=1.0, **options).points.numpy()
+    points = fem.Problem.build(mesh, law, length=1.0, **options).points.numpy()
     fixed = np.abs(points) < 1e-9
-    problem = Problem.build(mesh, law, fixed=fixed, length=1.0, **options)
+    problem = fem.Problem.build(mesh, law, fixed=fixed, length=1.0, **options)
     force = traction(
         problem,
         lambda x: np.linalg.norm(x, axis=1) < 3 + 1e-6,
         lambda x: x / np.linalg.norm(x, axis=0) / 1000,
     )
-    answer = solve(LinearSolver(problem), Load(force[None], torch.ones(1)))
+    answer = fem.solve(fem.LinearSolver(problem), fem.Load(force[None], torch.ones(1)))
     return answer.displacement[0, np.abs(points - [3, 0]).sum(axis=1).argmin(), 0].item()
 
 

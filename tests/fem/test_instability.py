@@ -17,21 +17,7 @@ from benchmarks.stress.fixtures import (
     equitriaxial_stretch,
     uniaxial_stretch,
 )
-from dpl.fem import (
-    Material,
-    NeoHookeanIsoK2,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Solution,
-    Status,
-    Traction,
-    box,
-    evaluate_solution,
-    solve,
-)
+from dpl import fem
 from dpl.fem.linear import SuperLU
 
 # a cell that is uniformly strained does not lock
@@ -40,11 +26,11 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:.*rounding allows no less"),  # moduli of 1 and 1e6
 ]
 
-SVK, NH = SaintVenantKirchhoff(0.0), NeoHookeanLn(0.0)
+SVK, NH = fem.SaintVenantKirchhoff(0.0), fem.NeoHookeanLn(0.0)
 EYE = torch.eye(3, dtype=torch.float64)
 
 
-def inertia(problem: Problem, displacement: Tensor) -> int:
+def inertia(problem: fem.Problem, displacement: Tensor) -> int:
     """Return the number of negative eigenvalues of K at a displacement (1, N, D)."""
     tangent = problem.linearise(displacement).tangent[0].numpy()
     return SuperLU(problem.pattern).factorise(tangent).negative_pivots
@@ -65,10 +51,10 @@ def bisected(loses, stable: float, unstable: float) -> float:
     return (stable + unstable) / 2
 
 
-def squeezed(problem: Problem, force: Tensor, P: float, **options) -> Solution:
+def squeezed(problem: fem.Problem, force: Tensor, P: float, **options) -> fem.Solution:
     """Return the answer to an axial load, from rest or from a guess."""
     guess = options.pop("guess", None)
-    solver = Newton(problem, tol=1e-10, linear="superlu", **options)
+    solver = fem.Newton(problem, tol=1e-10, linear="superlu", **options)
     *_, last = solver.iterate(as_load(P * force), guess=guess)
     return last
 
@@ -93,7 +79,10 @@ def test_column_loses_its_stability_at_the_critical_load(law, cells, printed):
 
     critical = bisected(buckles, 1.9, 2.2)
     assert critical == pytest.approx(printed, abs=5.1e-7)
-    for part, status, negative in ((0.9999, Status.CONVERGED, 0), (1.0001, Status.UNSTABLE, 2)):
+    for part, status, negative in (
+        (0.9999, fem.Status.CONVERGED, 0),
+        (1.0001, fem.Status.UNSTABLE, 2),
+    ):
         answer = squeezed(problem, force, part * critical)
         assert answer.status.item() == status
         assert answer.negative_pivots.item() == negative
@@ -114,7 +103,7 @@ def test_buckled_column_is_found_from_a_bent_guess(mixed, side, P, angle, printe
     answer = squeezed(
         problem, force, P, guess=bent_column(problem, angle, side), mixed_integration=mixed
     )
-    assert answer.status.item() == Status.CONVERGED
+    assert answer.status.item() == fem.Status.CONVERGED
     assert inertia(problem, answer.displacement) == 0
     centre = torch.tensor([1.0, 0.05, 0.05], dtype=torch.float64)
     end = answer.displacement[0, (problem.points - centre).norm(dim=1).argmin()] * side
@@ -123,17 +112,17 @@ def test_buckled_column_is_found_from_a_bent_guess(mixed, side, P, angle, printe
     assert abs(end[1].item()) < 1e-9
 
 
-def pulled(stretch: float | None = None) -> tuple[Problem, Tensor]:
+def pulled(stretch: float | None = None) -> tuple[fem.Problem, Tensor]:
     """Return a cube of one cell that slides on three planes, and its unit load along x.
 
     With a stretch its end is moved instead.
     """
-    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    mesh = fem.box([1.0, 1.0, 1.0], [2, 2, 2])
     held, given = mesh.p.T == 0, np.zeros((8, 3))
     if stretch is not None:
         held[:, 0], given[:, 0] = True, (stretch - 1) * mesh.p[0]
-    problem = Problem.build(mesh, RUBBER, fixed=held, prescribed=given, length=1.0)
-    return problem, Traction(Plane(0, "max"), [1.0, 0.0, 0.0]).on(problem)
+    problem = fem.Problem.build(mesh, RUBBER, fixed=held, prescribed=given, length=1.0)
+    return problem, fem.Traction(fem.Plane(0, "max"), [1.0, 0.0, 0.0]).on(problem)
 
 
 @pytest.mark.parametrize("off", [0.0, -0.01, 0.01])
@@ -149,7 +138,7 @@ def test_pull_on_yeohs_rubber_has_the_tabulated_extremes(stretch, printed, sign,
     """
     problem, _ = pulled(stretch + off)
     none = torch.zeros(problem.shape, dtype=torch.float64)
-    solver = Newton(problem, tol=1e-11, linear="superlu")
+    solver = fem.Newton(problem, tol=1e-11, linear="superlu")
     *_, answer = solver.iterate(as_load(none), guess=uniaxial_stretch(problem, stretch + off))
     assert answer.converged.all()
     far = problem.points[:, 0] == 1
@@ -163,15 +152,15 @@ def test_pull_on_yeohs_rubber_has_the_tabulated_extremes(stretch, printed, sign,
 def test_load_beyond_the_peak_is_reported_with_the_part_below_it():
     """Yeoh cube (felupe ex09): load control from rest ends at P = .5696673896."""
     problem, unit = pulled()
-    solver = Newton(
+    solver = fem.Newton(
         problem,
         linear="superlu",
         intermediate_tol=1e-9,
         min_load_step=2.0**-17,
         max_total_iter=2000,
     )
-    answer = solve(solver, as_load(0.57 * unit))
-    assert answer.status.item() == Status.NO_VALID_EQUILIBRIUM
+    answer = fem.solve(solver, as_load(0.57 * unit))
+    assert answer.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
     assert 0.57 * answer.load_factor.item() == pytest.approx(0.5696673896, abs=2e-5)
     assert 1 + answer.displacement[..., 0].max().item() == pytest.approx(1.364017197, abs=0.02)
 
@@ -179,15 +168,15 @@ def test_load_beyond_the_peak_is_reported_with_the_part_below_it():
 def test_rubber_beyond_the_peak_has_snapped_through():
     """Yeoh cube (felupe ex09): from a guess beyond the gap, P = .57 has the stretch 2.836546."""
     problem, unit = pulled()
-    solver = Newton(problem, tol=1e-10, linear="superlu")
+    solver = fem.Newton(problem, tol=1e-10, linear="superlu")
     *_, answer = solver.iterate(as_load(0.57 * unit), guess=uniaxial_stretch(problem, 2.8))
-    assert answer.status.item() == Status.CONVERGED
+    assert answer.status.item() == fem.Status.CONVERGED
     assert answer.load_factor.item() == 1
     stretch = 1 + answer.displacement[..., 0].max().item()
     assert stretch == pytest.approx(2.836546, abs=5e-6)
 
 
-def rivlin(law: Material) -> tuple[Problem, Tensor]:
+def rivlin(law: fem.Material) -> tuple[fem.Problem, Tensor]:
     """Return a cube of one cell that slides on three planes, pulled on the others by T = 1."""
     return cube(law, 1, (0, 1, 2))
 
@@ -198,14 +187,14 @@ def rivlin(law: Material) -> tuple[Problem, Tensor]:
 )
 def test_cube_of_rivlin_loses_its_symmetry_at_the_tabulated_load(poisson, stretch, load):
     """Cube of Rivlin (1948), NH-ln: the inertia changes by two; beyond, the answer says so."""
-    problem, unit = rivlin(NeoHookeanLn(poisson))
+    problem, unit = rivlin(fem.NeoHookeanLn(poisson))
     critical = bisected(partial(loses_symmetry, problem), 1.0, 1.1)
     assert critical == pytest.approx(stretch, abs=1.5e-9)
     assert equitriaxial_stretch(problem, critical)[1] == pytest.approx(load, abs=1e-7)
     assert inertia(problem, equitriaxial_stretch(problem, critical + 1e-6)[0]) == 2
-    for part, status, negative in ((0.99, Status.CONVERGED, 0), (1.01, Status.UNSTABLE, 2)):
+    for part, status, negative in ((0.99, fem.Status.CONVERGED, 0), (1.01, fem.Status.UNSTABLE, 2)):
         state, T = equitriaxial_stretch(problem, 1 + part * (critical - 1))
-        answer = solve(Newton(problem, linear="superlu"), as_load(T * unit))
+        answer = fem.solve(fem.Newton(problem, linear="superlu"), as_load(T * unit))
         assert answer.status.item() == status
         assert answer.negative_pivots.item() == negative
         assert (answer.displacement - state).abs().max() < 1e-7
@@ -213,7 +202,7 @@ def test_cube_of_rivlin_loses_its_symmetry_at_the_tabulated_load(poisson, stretc
 
 def test_compressible_cube_of_rivlin_keeps_its_symmetry():
     """Cube of Rivlin (1948): NH-ln with nu = .3 has no such load."""
-    problem, _ = rivlin(NeoHookeanLn(0.3))
+    problem, _ = rivlin(fem.NeoHookeanLn(0.3))
     for stretch in np.linspace(1.0, 4.0, 61):
         assert inertia(problem, equitriaxial_stretch(problem, stretch)[0]) == 0
 
@@ -222,7 +211,7 @@ def test_cube_of_rivlin_loses_its_symmetry_at_two_shear_moduli_in_the_limit():
     """Cube of Rivlin (1948): T / mu = 2 for incompressible bodies."""
     excess = []
     for poisson in (0.499, 0.4999):
-        law = NeoHookeanLn(poisson)
+        law = fem.NeoHookeanLn(poisson)
         problem, _ = rivlin(law)
         critical = bisected(partial(loses_symmetry, problem), 1.0, 1.1)
         excess.append(equitriaxial_stretch(problem, critical)[1] / float(law.mu) - 2)
@@ -230,7 +219,7 @@ def test_cube_of_rivlin_loses_its_symmetry_at_two_shear_moduli_in_the_limit():
     assert excess[0] / excess[1] == pytest.approx(10, rel=0.05)
 
 
-def bar(law: Material) -> tuple[Problem, Tensor]:
+def bar(law: fem.Material) -> tuple[fem.Problem, Tensor]:
     """Return a cube of 2 x 2 x 2 cells that slides on three planes, and the load P = 1 along x."""
     return cube(law, 2)
 
@@ -241,9 +230,9 @@ def bar(law: Material) -> tuple[Problem, Tensor]:
 )
 def test_neo_hookean_bar_answers_every_load(mixed, P, stretch):
     """NH-ln has a volumetric barrier: any compressive load has a solution from rest."""
-    problem, unit = bar(NeoHookeanLn(0.3))
-    answer = solve(
-        Newton(problem, tol=1e-11, linear="superlu", mixed_integration=mixed), as_load(P * unit)
+    problem, unit = bar(fem.NeoHookeanLn(0.3))
+    answer = fem.solve(
+        fem.Newton(problem, tol=1e-11, linear="superlu", mixed_integration=mixed), as_load(P * unit)
     )
     assert answer.converged.all()
     found = 1 + answer.displacement[0, problem.points[:, 0] == 1, 0]
@@ -253,46 +242,46 @@ def test_neo_hookean_bar_answers_every_load(mixed, P, stretch):
 @pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
 def test_quadratic_volume_term_is_no_barrier_under_pressure(mixed):
     """NHiso-k2 carries kappa s^2 (1 - s^3) at most, s^3 = 2/5; NH-ln carries any pressure."""
-    law = NeoHookeanIsoK2(0.3)
+    law = fem.NeoHookeanIsoK2(0.3)
     problem, unit = rivlin(law)
     limit = float(law.bulk) * 0.4 ** (2 / 3) * 0.6
-    for part, status in ((0.99, Status.CONVERGED), (1.02, Status.NO_VALID_EQUILIBRIUM)):
-        solver = Newton(problem, linear="superlu", mixed_integration=mixed)
-        answer = solve(solver, as_load(-part * limit * unit))
+    for part, status in ((0.99, fem.Status.CONVERGED), (1.02, fem.Status.NO_VALID_EQUILIBRIUM)):
+        solver = fem.Newton(problem, linear="superlu", mixed_integration=mixed)
+        answer = fem.solve(solver, as_load(-part * limit * unit))
         assert answer.status.item() == status
         assert answer.volume_ratio.item() > 0
     assert answer.load_factor.item() == pytest.approx(1 / 1.02, abs=0.02)
-    problem, unit = rivlin(NeoHookeanLn(0.3))
-    answer = solve(
-        Newton(problem, linear="superlu", mixed_integration=mixed), as_load(-3 * limit * unit)
+    problem, unit = rivlin(fem.NeoHookeanLn(0.3))
+    answer = fem.solve(
+        fem.Newton(problem, linear="superlu", mixed_integration=mixed), as_load(-3 * limit * unit)
     )
     assert answer.converged.all()
 
 
 def test_mirror_image_of_a_body_at_rest_is_no_answer():
     """SVK is invariant under reflection: a mirrored body has no internal forces."""
-    problem, _ = bar(SaintVenantKirchhoff(0.3))
+    problem, _ = bar(fem.SaintVenantKirchhoff(0.3))
     mirrored = (problem.points * torch.tensor([-2.0, 0.0, 0.0]))[None]
     assert problem.internal_force(mirrored).abs().max() < 1e-15
-    verdict = evaluate_solution(
+    verdict = fem.evaluate_solution(
         problem, mirrored, as_load(torch.zeros(problem.shape).double()), 1e-8
     )
     assert verdict.volume_ratio.item() == pytest.approx(-1.0)
-    assert verdict.status.item() == Status.NOT_CONVERGED
+    assert verdict.status.item() == fem.Status.NOT_CONVERGED
 
 
 def test_longest_load_of_a_saint_venant_bar_is_the_tabulated_one():
     """SVK, closed form: max |P| = E / (3 sqrt 3) = .1924500897 at a stretch of .57735."""
-    problem, unit = bar(SaintVenantKirchhoff(0.3))
-    solver = Newton(
+    problem, unit = bar(fem.SaintVenantKirchhoff(0.3))
+    solver = fem.Newton(
         problem,
         linear="superlu",
         intermediate_tol=1e-9,
         min_load_step=2.0**-17,
         max_total_iter=2000,
     )
-    answer = solve(solver, as_load(-0.2 * unit))
-    assert answer.status.item() == Status.NO_VALID_EQUILIBRIUM
+    answer = fem.solve(solver, as_load(-0.2 * unit))
+    assert answer.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
     assert 0.2 * answer.load_factor.item() == pytest.approx(0.1924500897, abs=1e-5)
     stretch = 1 + answer.displacement[..., 0].min().item()
     assert stretch == pytest.approx(1 / math.sqrt(3), abs=0.01)

@@ -15,14 +15,7 @@ from laws import COMPILED
 from numba import njit
 from torch import Tensor
 
-from dpl.fem import (
-    InvariantBasedMaterial,
-    NeoHookeanLn,
-    Plane,
-    Problem,
-    RobinBC,
-    YoungPoissonMaterial,
-)
+from dpl import fem
 from dpl.fem.assembly.numba_laws import Law
 from dpl.fem.assembly.simd import SIMD_WIDTH, load, sqrt, store
 from dpl.fem.materials.tensors import green_lagrange, invariants, trace
@@ -37,7 +30,7 @@ def cubed(x):
 
 
 @dataclass(frozen=True)
-class Coupled(YoungPoissonMaterial, InvariantBasedMaterial):
+class Coupled(fem.YoungPoissonMaterial, fem.InvariantBasedMaterial):
     """NH-ln + (I1 - 3)^3 / 50 + (I1 - 3)(I2 - 3) / 20 + (I2 - 3)^2 / 40: all derivatives."""
 
     def energy(self, H):
@@ -45,7 +38,7 @@ class Coupled(YoungPoissonMaterial, InvariantBasedMaterial):
         i1, second, _ = invariants(2 * green_lagrange(H))
         i2 = 2 * i1 + second
         more = i1**3 / 50 + i1 * i2 / 20 + i2**2 / 40
-        return NeoHookeanLn(self.poisson).energy(H) + more
+        return fem.NeoHookeanLn(self.poisson).energy(H) + more
 
     @property
     def constants(self):
@@ -63,29 +56,29 @@ class Coupled(YoungPoissonMaterial, InvariantBasedMaterial):
 
 
 @pytest.fixture(params=[*COMPILED, "own"])
-def law(request, laws) -> InvariantBasedMaterial:
+def law(request, laws) -> fem.InvariantBasedMaterial:
     """Each law of invariants, and one that is written here."""
     return Coupled(0.3) if request.param == "own" else laws[request.param]
 
 
 @pytest.fixture(params=["equal", "unequal"])
-def body(request, law, kind, grid, chain) -> Problem:
+def body(request, law, kind, grid, chain) -> fem.Problem:
     """Bodies of each kind of element, with an incomplete last block of SIMD lanes."""
     cell, degree = kind
     mesh = chain(cell, 2 * SIMD_WIDTH + 3) if request.param == "equal" else grid(cell, 3, 0.12)
-    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
+    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=degree)
     assert problem.discretisation.equal_cells == (request.param == "equal")
     assert len(problem.cells) % SIMD_WIDTH
     return problem
 
 
-class Reference(Problem):
+class Reference(fem.Problem):
     """A problem without compiled loops."""
 
     _compiled = None
 
 
-def reference(problem: Problem) -> Reference:
+def reference(problem: fem.Problem) -> Reference:
     """Return the same body without compiled loops."""
     return Reference(**problem.__getstate__())
 
@@ -166,7 +159,7 @@ def test_tiny_displacements_keep_their_digits(body, bend):
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_nan_in_a_displacement_gives_no_volume_ratio(law, kind, grid, bad):
     """In any cell, the last one of a block that is not full among them."""
-    problem = Problem.build(grid(kind[0], 3, 0.12), law, degree=kind[1])
+    problem = fem.Problem.build(grid(kind[0], 3, 0.12), law, degree=kind[1])
     for node in (0, problem.shape[0] // 2, problem.shape[0] - 1):
         u = torch.zeros(1, *problem.shape, dtype=torch.float64)
         u[0, node, 0] = bad
@@ -197,7 +190,7 @@ def test_inverted_body_has_a_negative_volume_ratio(body):
 @pytest.mark.parametrize("count", range(1, 2 * SIMD_WIDTH + 2))
 def test_number_of_cells_does_not_matter(chain, bend, count):
     """Blocks of SIMD lanes that are full, almost full, almost empty; equal and unequal cells."""
-    body = Problem.build(chain("quad", count), NeoHookeanLn(0.3), length=1.0)
+    body = fem.Problem.build(chain("quad", count), fem.NeoHookeanLn(0.3), length=1.0)
     several = replace(body, dN=body.dN.repeat(count, 1, 1, 1), dV=body.dV.repeat(count, 1))
     u = bend(body.points / count)
     for problem in (body, several):
@@ -210,7 +203,7 @@ def test_number_of_cells_does_not_matter(chain, bend, count):
 
 def test_order_of_axes_in_memory_does_not_matter(grid, bend):
     """Displacements from a network or a transposed file are not contiguous."""
-    body = Problem.build(grid("hexahedron"), NeoHookeanLn(0.3))
+    body = fem.Problem.build(grid("hexahedron"), fem.NeoHookeanLn(0.3))
     u = bend(body.points, 2)
     strided = u.permute(2, 1, 0).contiguous().permute(2, 1, 0)
     assert not strided.is_contiguous()
@@ -220,8 +213,10 @@ def test_order_of_axes_in_memory_does_not_matter(grid, bend):
 
 
 def test_springs_have_equal_forces_in_compiled_and_tensor_operations(kind, grid, bend):
-    spring = RobinBC(Plane(0, "max"), 0.7)
-    body = Problem.build(grid(kind[0]), NeoHookeanLn(0.3), supports=[spring], degree=kind[1])
+    spring = fem.RobinBC(fem.Plane(0, "max"), 0.7)
+    body = fem.Problem.build(
+        grid(kind[0]), fem.NeoHookeanLn(0.3), supports=[spring], degree=kind[1]
+    )
     u, plain = bend(body.points), reference(body)
     check_equal(body.evaluate(u).internal, plain.evaluate(u).internal)
     check_equal(body.linearise(u).tangent, plain.linearise(u).tangent)
@@ -230,7 +225,7 @@ def test_springs_have_equal_forces_in_compiled_and_tensor_operations(kind, grid,
 
 
 def test_law_without_invariant_derivatives_is_not_compiled(grid, laws, bend):
-    body = Problem.build(grid("hexahedron"), laws["ogden_k2"])
+    body = fem.Problem.build(grid("hexahedron"), laws["ogden_k2"])
     assert body._compiled is None
     u = bend(body.points)
     assert torch.equal(body.evaluate(u).internal, body.internal_force(u))
@@ -239,7 +234,7 @@ def test_law_without_invariant_derivatives_is_not_compiled(grid, laws, bend):
 
 def test_problem_sent_to_another_process_keeps_its_arrays(grid, bend):
     """Torch moves the memory of tensors that it sends; arrays made of them must not dangle."""
-    body = Problem.build(grid("hexahedron"), NeoHookeanLn(0.3))
+    body = fem.Problem.build(grid("hexahedron"), fem.NeoHookeanLn(0.3))
     u = bend(body.points)
     before = body.evaluate(u).internal
     ForkingPickler.dumps(body)
@@ -315,13 +310,13 @@ def test_type_of_a_law_changes_with_the_source_of_its_derivatives(written, part)
 
 
 def test_type_of_a_law_changes_with_the_code_of_the_loops():
-    first, other = (Law(NeoHookeanLn, 2, code).kind.name for code in ("one", "another"))
+    first, other = (Law(fem.NeoHookeanLn, 2, code).kind.name for code in ("one", "another"))
     assert first != other
 
 
 @pytest.mark.parametrize("part", [None, *PARTS])
 def test_laws_of_one_name_are_not_confused(written, grid, bend, part):
-    body = Problem.build(grid("quad"), written("module", **PARTS.get(part, {})).Mine(0.3))
+    body = fem.Problem.build(grid("quad"), written("module", **PARTS.get(part, {})).Mine(0.3))
     u = bend(body.points)
     check_equal(body.evaluate(u).internal, reference(body).evaluate(u).internal)
 
@@ -392,7 +387,7 @@ def test_simd_vectors_preserve_infinity_and_nan():
 
 def test_trace_of_a_gap_is_that_of_its_six_numbers(grid, bend):
     """Strains in the kernels are 2 E: 11 22 33 12 23 13."""
-    body = Problem.build(grid("hexahedron"), NeoHookeanLn(0.3), length=1.0)
+    body = fem.Problem.build(grid("hexahedron"), fem.NeoHookeanLn(0.3), length=1.0)
     stretch = 0.2 * body.points[None] * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     gap = body.update_strain_gap(None, 1.0, stretch)
     assert gap[0][0, 0, :, 0] == pytest.approx([0.04, 0.16, 0.36, 0, 0, 0], abs=1e-14)

@@ -9,38 +9,16 @@ import torch
 from laws import ISOTROPIC, LAWS
 from torch.testing import assert_close
 
-from dpl.fem import (
-    ActiveStress,
-    ConstantFibres,
-    DirichletBC,
-    FibreFunction,
-    FibreReinforced,
-    FollowerPressure,
-    Guccione,
-    LinearElastic,
-    LinearSolver,
-    Load,
-    NeoHookeanIsoK2,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    Status,
-    Traction,
-    VolumetricK4,
-    box,
-    rectangle,
-    solve,
-)
+from dpl import fem
 from dpl.fem.linear import full_matrix
 
 
 @pytest.fixture(params=[("quad", 1), ("quad", 2), ("hexahedron", 1)], ids=str)
-def dilated(request, any_law, grid) -> Problem:
+def dilated(request, any_law, grid) -> fem.Problem:
     """Bodies of unequal cells with projected volume ratios."""
     cell, degree = request.param
     mesh = grid(cell, 2, 0.15)
-    return Problem.build(
+    return fem.Problem.build(
         mesh,
         any_law,
         fixed=lambda points: points[:, 0] < 0.2,
@@ -50,7 +28,7 @@ def dilated(request, any_law, grid) -> Problem:
     )
 
 
-def standard(problem: Problem) -> Problem:
+def standard(problem: fem.Problem) -> fem.Problem:
     """Return the same body whose points keep their own volume ratio."""
     return replace(problem, volume_functions=None)
 
@@ -98,11 +76,11 @@ def test_mean_dilatation_passes_the_patch_test(cell, any_law, grid):
     H = np.array([[0.2, 0.2, -0.1], [0.05, -0.05, 0.15], [-0.08, 0.12, 0.1]])[:dim, :dim]
     outside = np.zeros(mesh.p.shape[1], dtype=bool)
     outside[mesh.boundary_nodes()] = True
-    problem = Problem.build(
+    problem = fem.Problem.build(
         mesh, any_law, fixed=outside, prescribed=mesh.p.T @ H.T, length=1.0, mean_dilatation=True
     )
-    load = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
-    answer = solve(Newton(problem, tol=1e-12, linear="superlu"), load)
+    load = fem.Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
+    answer = fem.solve(fem.Newton(problem, tol=1e-12, linear="superlu"), load)
     assert answer.converged.all()
     expected = problem.points @ torch.from_numpy(H).T
     assert_close(answer.displacement[0], expected, rtol=0, atol=1e-11)
@@ -114,17 +92,17 @@ def test_mean_dilatation_passes_the_patch_test(cell, any_law, grid):
 def test_mean_dilatation_does_not_lock(cell):
     """At nu = 0.4999 the compliance is within 6 % of quadratic cells, which hardly lock."""
     size, nodes = ([10.0, 2.0], [21, 5]) if cell == "quad" else ([10.0, 2.0, 2.0], [21, 5, 3])
-    build = rectangle if cell == "quad" else box
-    law, sags = NeoHookeanLn(0.4999), {}
+    build = fem.rectangle if cell == "quad" else fem.box
+    law, sags = fem.NeoHookeanLn(0.4999), {}
     options = {"locked": {}, "dilated": {"mean_dilatation": True}, "quadratic": {"degree": 2}}
     for name, option in options.items():
         mesh = build(size, nodes, cell)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            problem = Problem.build(mesh, law, fixed=Plane(0, "min"), **option)
+            problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), **option)
         value = [0.0, -1e-6, 0.0][: len(size)]
-        force = Traction(Plane(0, "max"), value).on(problem)
-        sags[name] = (LinearSolver(problem, linear="superlu").solve(force) * force).sum().item()
+        force = fem.Traction(fem.Plane(0, "max"), value).on(problem)
+        sags[name] = (fem.LinearSolver(problem, linear="superlu").solve(force) * force).sum().item()
     assert sags["locked"] < 0.5 * sags["quadratic"]
     assert sags["dilated"] == pytest.approx(sags["quadratic"], rel=0.06)
 
@@ -133,7 +111,7 @@ def test_mean_dilatation_does_not_lock(cell):
 @pytest.mark.parametrize("cell", ["triangle", "tetra"])
 def test_mean_dilatation_is_refused_of_simplices(grid, cell, degree):
     with pytest.raises(ValueError, match="mean_dilatation"):
-        Problem.build(grid(cell), NeoHookeanLn(0.3), degree=degree, mean_dilatation=True)
+        fem.Problem.build(grid(cell), fem.NeoHookeanLn(0.3), degree=degree, mean_dilatation=True)
 
 
 def test_forces_of_mean_dilatation_are_objective(dilated, bend):
@@ -150,17 +128,17 @@ def test_forces_of_mean_dilatation_are_objective(dilated, bend):
 
 def test_linear_law_of_mean_dilatation_is_linear(beam, pull):
     """A linear problem converges in exactly one iteration."""
-    problem = beam(LinearElastic(0.3), mean_dilatation=True)
-    answer = solve(Newton(problem), Load(pull(problem, 20.0), torch.ones(1)))
+    problem = beam(fem.LinearElastic(0.3), mean_dilatation=True)
+    answer = fem.solve(fem.Newton(problem), fem.Load(pull(problem, 20.0), torch.ones(1)))
     assert answer.iterations.item() == 1
 
 
 def test_beam_of_mean_dilatation_keeps_its_volume(beam, pull):
     """The volume ratio of each cell tends to 1 as nu tends to 1/2, that of its points need not."""
-    problem = beam(NeoHookeanLn(0.4999), 4, 2, mean_dilatation=True)
+    problem = beam(fem.NeoHookeanLn(0.4999), 4, 2, mean_dilatation=True)
     force = pull(problem, 20.0)
-    answer = solve(Newton(problem), Load(force, torch.ones(1)))
-    assert answer.status.item() == Status.CONVERGED
+    answer = fem.solve(fem.Newton(problem), fem.Load(force, torch.ones(1)))
+    assert answer.status.item() == fem.Status.CONVERGED
     F = torch.einsum("eai,eqaj->eqij", answer.displacement[0][problem.cells], problem.dN)
     J = torch.linalg.det(F + torch.eye(3, dtype=torch.float64))
     weight = problem.dV / problem.dV.sum(dim=1, keepdim=True)
@@ -168,7 +146,7 @@ def test_beam_of_mean_dilatation_keeps_its_volume(beam, pull):
     assert (J - 1).abs().max() > 1e-2
 
 
-class Reference(Problem):
+class Reference(fem.Problem):
     """A problem without compiled loops."""
 
     _compiled = None
@@ -196,7 +174,7 @@ def test_loops_of_mean_dilatation_are_those_of_the_tensors(dilated, bend):
 
 def test_volume_gap_is_what_the_linear_change_of_volume_falls_short_of(grid, bend):
     body = Reference.build(
-        grid("quad", 2, 0.15), NeoHookeanLn(0.4), degree=2, length=1.0, mean_dilatation=True
+        grid("quad", 2, 0.15), fem.NeoHookeanLn(0.4), degree=2, length=1.0, mean_dilatation=True
     )
     u, v = bend(body.points), bend(body.points, seed=1)
 
@@ -217,21 +195,26 @@ def poisson(ratio: float) -> float:
     return (3 * ratio - 2) / (6 * ratio + 2)
 
 
-def solved(problem: Problem, **options):
+def solved(problem: fem.Problem, **options):
     """Return the solution without a force."""
-    load = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
-    return solve(Newton(problem, **options), load)
+    load = fem.Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
+    return fem.solve(fem.Newton(problem, **options), load)
 
 
 @pytest.mark.parametrize("degree", [1, 2])
 def test_iterations_do_not_depend_on_the_bulk_modulus(degree):
     """A cantilever that bends by half of its length; bulk over shear modulus from 10 to 1e5."""
-    mesh, counts = box([4.0, 1.0, 1.0], [13, 4, 4] if degree == 1 else [7, 3, 3]), []
+    mesh, counts = fem.box([4.0, 1.0, 1.0], [13, 4, 4] if degree == 1 else [7, 3, 3]), []
     for bulk in (10.0, 1e3, 1e5):
-        problem = Problem.build(
-            mesh, NeoHookeanIsoK2(poisson(bulk)), fixed=Plane(0, "min"), degree=degree, length=1.0,
-            mean_dilatation=True, follower_loads=[FollowerPressure(Plane(2, "max"), 4e-3)],
-        )  # fmt: skip
+        problem = fem.Problem.build(
+            mesh,
+            fem.NeoHookeanIsoK2(poisson(bulk)),
+            fixed=fem.Plane(0, "min"),
+            degree=degree,
+            length=1.0,
+            mean_dilatation=True,
+            follower_loads=[fem.FollowerPressure(fem.Plane(2, "max"), 4e-3)],
+        )
         solution = solved(problem, tol=1e-6)
         assert solution.converged.item()
         counts.append(solution.iterations.item())
@@ -247,10 +230,15 @@ def test_laws_with_fibres_converge_near_incompressibility(name):
     for ratio in (1e2, 1e5):
         nearly = {"poisson": poisson(ratio)} if hasattr(law.matrix, "poisson") else {}
         stiff = replace(law, matrix=replace(law.matrix, **(nearly or {"bulk": ratio * mu})))
-        problem = Problem.build(
-            box([4.0, 1.0, 1.0], [5, 2, 2]), stiff, fixed=Plane(0, "min"), degree=2, length=1.0,
-            mean_dilatation=True, follower_loads=[FollowerPressure(Plane(2, "max"), 0.01 * mu)],
-        )  # fmt: skip
+        problem = fem.Problem.build(
+            fem.box([4.0, 1.0, 1.0], [5, 2, 2]),
+            stiff,
+            fixed=fem.Plane(0, "min"),
+            degree=2,
+            length=1.0,
+            mean_dilatation=True,
+            follower_loads=[fem.FollowerPressure(fem.Plane(2, "max"), 0.01 * mu)],
+        )
         solution = solved(problem, tol=1e-6)
         assert solution.converged.item()
         assert solution.iterations.item() <= 10
@@ -259,18 +247,26 @@ def test_laws_with_fibres_converge_near_incompressibility(name):
     assert found[1] > 0.5
 
 
-def muscle(bulk: float, **options) -> Problem:
+def muscle(bulk: float, **options) -> fem.Problem:
     """Return a bar of Guccione's law whose fibres turn across it, contracting by 5 times C."""
 
     def turning(points):
         angle = np.pi * (points[:, 2] - 0.5)
         return np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
 
-    law = FibreReinforced(VolumetricK4(bulk), Guccione(1.0, 8.0, 2.0, 4.0), FibreFunction(turning))
-    return Problem.build(
-        box([2.0, 1.0, 1.0], [5, 3, 3]), law, supports=[DirichletBC(Plane(0, "min"))], degree=2,
-        length=1.0, follower_loads=[ActiveStress(5.0)], mean_dilatation=True, **options,
-    )  # fmt: skip
+    law = fem.FibreReinforced(
+        fem.VolumetricK4(bulk), fem.Guccione(1.0, 8.0, 2.0, 4.0), fem.FibreFunction(turning)
+    )
+    return fem.Problem.build(
+        fem.box([2.0, 1.0, 1.0], [5, 3, 3]),
+        law,
+        supports=[fem.DirichletBC(fem.Plane(0, "min"))],
+        degree=2,
+        length=1.0,
+        follower_loads=[fem.ActiveStress(5.0)],
+        mean_dilatation=True,
+        **options,
+    )
 
 
 def test_contraction_near_incompressibility_converges_from_rest():
@@ -287,11 +283,11 @@ def test_contraction_near_incompressibility_converges_from_rest():
 
 def test_bulk_modulus_of_the_points_is_that_of_laws_with_fibres_only():
     """It vanishes from the energy of a homogeneous change of volume."""
-    law = FibreReinforced(
-        VolumetricK4(9.0), Guccione(1.0, 8.0, 2.0, 4.0), ConstantFibres([1, 0, 0])
+    law = fem.FibreReinforced(
+        fem.VolumetricK4(9.0), fem.Guccione(1.0, 8.0, 2.0, 4.0), fem.ConstantFibres([1, 0, 0])
     )
     assert law.point_bulk.item() == pytest.approx(2 * law.mu.item())
-    assert NeoHookeanLn(0.3).point_bulk == 0.0
+    assert fem.NeoHookeanLn(0.3).point_bulk == 0.0
     problem = muscle(9.0)
     u = 0.05 * problem.points[None]
     assert_close(problem.energy(u), replace(problem, volume_functions=None).energy(u))

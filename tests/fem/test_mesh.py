@@ -21,21 +21,7 @@ from benchmarks.stress.broken_meshes import (
     TWO_HEXES,
     write,
 )
-from dpl.fem import (
-    Cylinder,
-    FollowerPressure,
-    NeoHookeanLn,
-    Plane,
-    Problem,
-    Tag,
-    box,
-    finger,
-    propeller,
-    read_mesh,
-    rectangle,
-    write_mesh,
-    write_mesh_exactly,
-)
+from dpl import fem
 from dpl.fem.mesh import check_mesh, nodes_in
 from dpl.fem.mesh.generators import aspect_ratio, longest_side
 
@@ -46,10 +32,10 @@ def volumes(mesh: skfem.Mesh) -> np.ndarray:
 
 
 GRIDS = [
-    (box, [4.0, 1.0, 2.0], [5, 2, 3], "hexahedron", 8),
-    (box, [4.0, 1.0, 2.0], [5, 2, 3], "tetra", 48),
-    (rectangle, [4.0, 1.0], [5, 3], "quad", 8),
-    (rectangle, [4.0, 1.0], [5, 3], "triangle", 16),
+    (fem.box, [4.0, 1.0, 2.0], [5, 2, 3], "hexahedron", 8),
+    (fem.box, [4.0, 1.0, 2.0], [5, 2, 3], "tetra", 48),
+    (fem.rectangle, [4.0, 1.0], [5, 3], "quad", 8),
+    (fem.rectangle, [4.0, 1.0], [5, 3], "triangle", 16),
 ]
 
 
@@ -76,7 +62,7 @@ def test_node_numbers_of_a_grid_have_a_small_bandwidth(grid, size, nodes, cell, 
 
 @pytest.mark.parametrize("order", [(9, 3, 2), (2, 9, 3), (3, 2, 9)])
 def test_bandwidth_of_a_box_does_not_depend_on_the_direction_of_its_long_side(order):
-    assert np.ptp(box([1.0, 1.0, 1.0], order).t, axis=0).max() == 2 * 3 + 2 + 1
+    assert np.ptp(fem.box([1.0, 1.0, 1.0], order).t, axis=0).max() == 2 * 3 + 2 + 1
 
 
 @pytest.mark.parametrize(
@@ -98,14 +84,14 @@ def test_bandwidth_of_a_box_does_not_depend_on_the_direction_of_its_long_side(or
 )
 def test_box_out_of_range_is_an_error(size, nodes, cell, message):
     with pytest.raises(ValueError, match=message):
-        box(size, nodes, cell)
+        fem.box(size, nodes, cell)
 
 
 def test_rectangle_out_of_range_is_an_error():
     with pytest.raises(ValueError, match="size"):
-        rectangle([1, 1, 1], [2, 2])
+        fem.rectangle([1, 1, 1], [2, 2])
     with pytest.raises(ValueError, match="cell"):
-        rectangle([1, 1], [2, 2], "hexahedron")
+        fem.rectangle([1, 1], [2, 2], "hexahedron")
 
 
 def test_more_nodes_than_fit_are_refused_before_they_are_made(monkeypatch):
@@ -114,9 +100,9 @@ def test_more_nodes_than_fit_are_refused_before_they_are_made(monkeypatch):
 
     monkeypatch.setattr(np, "linspace", forbidden)
     for make in (
-        lambda: box([1, 1, 1], [10**9, 3, 3]),
-        lambda: rectangle([1, 1], [10**6, 10**6]),
-        lambda: propeller(cells=[1, 1, 1, 2, 10**12]),
+        lambda: fem.box([1, 1, 1], [10**9, 3, 3]),
+        lambda: fem.rectangle([1, 1], [10**6, 10**6]),
+        lambda: fem.propeller(cells=[1, 1, 1, 2, 10**12]),
     ):
         with pytest.raises(MemoryError, match=r"nodes need .* GB, there are .* GB; take fewer"):
             make()
@@ -131,14 +117,14 @@ def rotated(points: np.ndarray, angle: float) -> np.ndarray:
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 1.0, 2.5])
 def test_longest_side_of_a_beam_does_not_depend_on_its_orientation(angle):
-    beam = box([4.0, 1.0, 0.5], [9, 3, 2]).p.T + np.array([10, -3, 2])
+    beam = fem.box([4.0, 1.0, 0.5], [9, 3, 2]).p.T + np.array([10, -3, 2])
     assert longest_side(rotated(beam, angle)) == pytest.approx(4.0, rel=1e-9)
 
 
 @pytest.mark.parametrize("nodes", [2, 3, 6])
 def test_longest_side_of_a_cube_is_its_side(nodes):
-    assert longest_side(box([2.0] * 3, [nodes] * 3).p.T) == pytest.approx(2.0, rel=1e-12)
-    assert longest_side(rectangle([2.0] * 2, [nodes] * 2).p.T) == pytest.approx(2.0, rel=1e-12)
+    assert longest_side(fem.box([2.0] * 3, [nodes] * 3).p.T) == pytest.approx(2.0, rel=1e-12)
+    assert longest_side(fem.rectangle([2.0] * 2, [nodes] * 2).p.T) == pytest.approx(2.0, rel=1e-12)
 
 
 def scaled_jacobian(mesh: skfem.MeshHex) -> np.ndarray:
@@ -158,16 +144,16 @@ def scaled_jacobian(mesh: skfem.MeshHex) -> np.ndarray:
 
 
 def test_finger_has_a_closed_chamber_within_its_walls():
-    mesh = finger([8.0, 4.0, 6.0], [8, 4, 6])
+    mesh = fem.finger([8.0, 4.0, 6.0], [8, 4, 6])
     assert len(mesh.t.T) == 8 * 4 * 6 - 6 * 2 * 2
     facets = mesh.boundaries["chamber"]
     assert len(facets) == 2 * (6 * 2 + 6 * 2 + 2 * 2)
     corners = mesh.p[:, np.unique(mesh.facets[:, facets])]
     np.testing.assert_allclose(corners.min(axis=1), [1, 1, 3])
     np.testing.assert_allclose(corners.max(axis=1), [7, 3, 5])
-    chamber = FollowerPressure(Tag("chamber"), 1.0)
-    problem = Problem.build(
-        mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), follower_loads=[chamber]
+    chamber = fem.FollowerPressure(fem.Tag("chamber"), 1.0)
+    problem = fem.Problem.build(
+        mesh, fem.NeoHookeanLn(0.3), fixed=fem.Plane(0, "min"), follower_loads=[chamber]
     )
     assert float(problem.force_at_rest.sum(dim=0).abs().max()) < 1e-12, "it is closed"
 
@@ -175,21 +161,21 @@ def test_finger_has_a_closed_chamber_within_its_walls():
 @pytest.mark.parametrize("cells", [[2, 4, 4], [8, 2, 4], [8, 4, 5], [8, 4], [8, 4, 2]])
 def test_finger_without_walls_is_an_error_of_one_line(cells):
     with pytest.raises(ValueError, match=r"cells = .* must be at least \[3, 3, 4\]"):
-        finger(cells=cells)
+        fem.finger(cells=cells)
 
 
 def test_propeller_has_the_size_of_the_papers():
     """4,025 nodes, 12,075 degrees of freedom; a metre long; fixed at 525 of them."""
-    mesh = propeller()
+    mesh = fem.propeller()
     assert mesh.p.shape == (3, 4025)
     assert mesh.t.shape == (8, 2550)
     assert longest_side(mesh.p.T) == pytest.approx(1.0, rel=0.03)
     radius = np.hypot(mesh.p[1], mesh.p[2])
     assert radius.max() == pytest.approx(0.5, rel=1e-12)
     assert radius.min() == pytest.approx(0.05, rel=1e-12)
-    bore = nodes_in(Tag("bore"), skfem.Basis(mesh, skfem.ElementHex1()))
+    bore = nodes_in(fem.Tag("bore"), skfem.Basis(mesh, skfem.ElementHex1()))
     assert bore.sum() == 175
-    assert np.array_equal(bore, Cylinder(0, 0.05)(mesh.p.T))
+    assert np.array_equal(bore, fem.Cylinder(0, 0.05)(mesh.p.T))
     assert {name: len(cells) for name, cells in mesh.subdomains.items()} == {
         "hub": 300,
         "blades": 2250,
@@ -198,7 +184,7 @@ def test_propeller_has_the_size_of_the_papers():
 
 @pytest.mark.parametrize("options", [{}, {"blades": 3, "cells": [2, 4, 1, 4, 9]}, {"blades": 2}])
 def test_propeller_counts_by_its_formula_and_its_cells_are_sound(options):
-    mesh = propeller(**options)
+    mesh = fem.propeller(**options)
     blades, (t, g, w, c, s) = options.get("blades", 5), options.get("cells", (3, 2, 2, 6, 25))
     nodes = blades * (t + g) * (w + 1) * (c + 1) + blades * (t + 1) * (c + 1) * s
     assert mesh.p.shape == (3, nodes)
@@ -211,7 +197,7 @@ def test_propeller_counts_by_its_formula_and_its_cells_are_sound(options):
 
 @pytest.mark.parametrize("blades", [2, 5, 6])
 def test_propeller_is_invariant_under_rotation_by_one_blade(blades):
-    p = propeller(blades=blades).p.T
+    p = fem.propeller(blades=blades).p.T
     c, s = math.cos(2 * math.pi / blades), math.sin(2 * math.pi / blades)
     rotated = p @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
     assert np.array_equal(*(np.unique(np.round(q, 9) + 0.0, axis=0) for q in (p, rotated)))
@@ -219,7 +205,7 @@ def test_propeller_is_invariant_under_rotation_by_one_blade(blades):
 
 def test_blades_of_a_propeller_twist_and_taper():
     """Measured on the first blade: direction and length of its sections' chords."""
-    mesh = propeller(blades=5)
+    mesh = fem.propeller(blades=5)
     radius, angle = np.hypot(mesh.p[1], mesh.p[2]), np.arctan2(mesh.p[2], mesh.p[1])
     pitch, chord = [], []
     for r in np.linspace(0.116, 0.5, 25):
@@ -237,7 +223,7 @@ def test_blades_of_a_propeller_twist_and_taper():
 
 def test_node_numbers_of_the_propeller_have_a_small_bandwidth():
     """Reverse Cuthill-McKee: a ring of all blades, not the whole of one."""
-    assert np.ptp(propeller().t, axis=0).max() < 250
+    assert np.ptp(fem.propeller().t, axis=0).max() < 250
 
 
 @pytest.mark.parametrize(
@@ -266,20 +252,20 @@ def test_node_numbers_of_the_propeller_have_a_small_bandwidth():
 )
 def test_propeller_out_of_range_is_an_error_of_one_line(options, message):
     with pytest.raises(ValueError, match=message) as error:
-        propeller(**options)
+        fem.propeller(**options)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
     ("mesh", "ratio"),
     [
-        (box([2.0, 2.0, 2.0], [2, 2, 2]), 1.0),
-        (box([5.0, 1.0, 2.0], [2, 2, 2]), 5.0),
-        (box([1.0, 1.0, 0.01], [5, 5, 2]), 25.0),
-        (rectangle([3.0, 1.0], [2, 2]), 3.0),
-        (rectangle([1.0, 1.0], [2, 2], "triangle"), math.sqrt(3)),
-        (box([1.0, 1.0, 1.0], [3, 3, 3], "tetra"), 1 + math.sqrt(2)),
-        (skfem.MeshHex2.from_mesh(box([5.0, 1.0, 2.0], [2, 2, 2])), 5.0),
+        (fem.box([2.0, 2.0, 2.0], [2, 2, 2]), 1.0),
+        (fem.box([5.0, 1.0, 2.0], [2, 2, 2]), 5.0),
+        (fem.box([1.0, 1.0, 0.01], [5, 5, 2]), 25.0),
+        (fem.rectangle([3.0, 1.0], [2, 2]), 3.0),
+        (fem.rectangle([1.0, 1.0], [2, 2], "triangle"), math.sqrt(3)),
+        (fem.box([1.0, 1.0, 1.0], [3, 3, 3], "tetra"), 1 + math.sqrt(2)),
+        (skfem.MeshHex2.from_mesh(fem.box([5.0, 1.0, 2.0], [2, 2, 2])), 5.0),
         (skfem.MeshTri(np.array([[0, 1, 0.5], [0, 0, 0.75**0.5]]), np.array([[0], [1], [2]])), 1.0),
     ],
 )
@@ -309,7 +295,7 @@ WRITTEN = {  # type, nodes, cells and their volumes in ascending order
 @pytest.mark.parametrize("cell", WRITTEN)
 def test_cells_of_a_file_are_those_that_were_written_planar_ones_in_2d(tmp_path, cell, suffix):
     kind, points, cells, sizes = WRITTEN[cell]
-    mesh = read_mesh(write(tmp_path / f"body{suffix}", points, **{cell: cells}))
+    mesh = fem.read_mesh(write(tmp_path / f"body{suffix}", points, **{cell: cells}))
     assert isinstance(mesh, kind)
     assert np.array_equal(mesh.p.T, points[:, : mesh.dim()])
     assert np.sort(volumes(mesh)) == pytest.approx(sizes, rel=1e-14)
@@ -321,7 +307,7 @@ def test_quadratic_tetrahedra_keep_their_curved_edges(tmp_path, suffix):
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
     points = np.concatenate([corners, [(corners[a] + corners[b]) / 2 for a, b in edges]])
     points[5] += 0.05  # the middle of edge 1-2 bulges
-    mesh = read_mesh(write(tmp_path / f"curved{suffix}", points, tetra10=np.arange(10)[None]))
+    mesh = fem.read_mesh(write(tmp_path / f"curved{suffix}", points, tetra10=np.arange(10)[None]))
     assert isinstance(mesh, skfem.MeshTet2)
     assert {tuple(x) for x in mesh.p.T} == {tuple(x) for x in points}
     assert volumes(mesh)[0] > 1 / 6 + 1e-3
@@ -334,7 +320,7 @@ def test_quadratic_hexahedra_keep_their_volume(tmp_path):
     faces = [(0, 4, 7, 3), (1, 5, 6, 2), (0, 1, 5, 4), (3, 2, 6, 7), (0, 3, 2, 1), (4, 5, 6, 7)]
     groups = [(k,) for k in range(8)] + edges + faces + [tuple(range(8))]  # order of VTK
     points = np.array([CORNERS[list(group)].mean(axis=0) for group in groups]) * [3, 2, 1]
-    mesh = read_mesh(write(tmp_path / "brick.vtu", points, hexahedron27=np.arange(27)[None]))
+    mesh = fem.read_mesh(write(tmp_path / "brick.vtu", points, hexahedron27=np.arange(27)[None]))
     assert isinstance(mesh, skfem.MeshHex2)
     assert volumes(mesh) == pytest.approx(6.0, rel=1e-13)
 
@@ -368,7 +354,7 @@ def test_cells_that_are_listed_inside_out_are_read_and_counted_in_a_warning(tmp_
     points, cells, reported = INSIDE_OUT[name]
     path = write(tmp_path / "part.vtu", points, **{name.removeprefix("one "): cells})
     with pytest.warns(UserWarning, match=rf"part\.vtu: {reported}") as warned:
-        mesh = read_mesh(path)
+        mesh = fem.read_mesh(path)
     assert len(warned) == 1
     size = np.ptp(points, axis=0)
     assert volumes(mesh).sum() == pytest.approx(np.prod(size[: mesh.dim()]), rel=1e-14)
@@ -378,7 +364,7 @@ def test_nodes_that_no_cell_uses_are_counted_in_the_warning(tmp_path):
     points = np.concatenate([[[9, 9, 9]], TWO_CUBES, [[8, 8, 8], [7, 7, 7]]])
     path = write(tmp_path / "part.vtu", points, hexahedron=TWO_HEXES + 1)
     with pytest.warns(UserWarning, match="3 nodes belong to no cell; they are dropped$"):
-        mesh = read_mesh(path)
+        mesh = fem.read_mesh(path)
     assert np.array_equal(mesh.p.T, TWO_CUBES)
 
 
@@ -392,7 +378,7 @@ def test_a_valid_file_is_read_without_a_warning(tmp_path):
         path = write(tmp_path / f"{kind}.vtu", points, **{kind: cells})
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            assert read_mesh(path).nelements == len(cells)
+            assert fem.read_mesh(path).nelements == len(cells)
 
 
 NUMBERS = {  # format: file, a node of it, the same with the number of another, words
@@ -415,19 +401,19 @@ def test_a_node_number_that_is_listed_twice_is_an_error_that_names_it(tmp_path, 
     path = tmp_path / name
     binary = {"binary": False} if kind.startswith("gmsh") else {}
     meshio.write(path, meshio.Mesh(CORNERS, [("tetra", TETS)]), file_format=kind, **binary)
-    assert read_mesh(path).nvertices == 8
+    assert fem.read_mesh(path).nvertices == 8
     text = path.read_text()
     assert text.count(own) == 1
     path.write_text(text.replace(own, other))
     with pytest.raises(ValueError, match=reported) as error:
-        read_mesh(path)
+        fem.read_mesh(path)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
 def test_a_body_that_touches_itself_in_a_node_is_one_body(cell):
     """A ring of cells that is pinched: joined by sides all around."""
-    grid, dim = (rectangle, 2) if cell in ("quad", "triangle") else (box, 3)
+    grid, dim = (fem.rectangle, 2) if cell in ("quad", "triangle") else (fem.box, 3)
     mesh = grid([4.0, 4.0, 1.0][:dim], [5, 5, 2][:dim], cell)
     x, y = mesh.p[:2, mesh.t].mean(axis=1)
     hole = ((x > 1) & (x < 2) & (y > 1) & (y < 2)) | ((x > 2) & (x < 3) & (y > 2) & (y < 3))
@@ -445,7 +431,7 @@ def test_cells_of_the_highest_dimension_and_their_nodes_are_kept(tmp_path):
         quad=TWO_HEXES[:, :4] + 1,
         hexahedron=TWO_HEXES + 1,
     )
-    mesh = read_mesh(path)
+    mesh = fem.read_mesh(path)
     assert np.array_equal(mesh.p.T, TWO_CUBES)
     assert mesh.t.shape == (8, 2)
 
@@ -454,14 +440,14 @@ def test_several_blocks_of_one_kind_are_one_body(tmp_path):
     blocks = [("hexahedron", TWO_HEXES[:1]), ("line", [[0, 1]]), ("hexahedron", TWO_HEXES[1:])]
     meshio.write(tmp_path / "bar.vtu", meshio.Mesh(TWO_CUBES, blocks))
     assert len(meshio.read(tmp_path / "bar.vtu").cells) == 3
-    assert read_mesh(tmp_path / "bar.vtu").t.shape == (8, 2)
+    assert fem.read_mesh(tmp_path / "bar.vtu").t.shape == (8, 2)
 
 
 def test_missing_file_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.vtu"):
-        read_mesh(tmp_path / "none.vtu")
+        fem.read_mesh(tmp_path / "none.vtu")
     with pytest.raises(FileNotFoundError):
-        read_mesh(tmp_path)
+        fem.read_mesh(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["junk.vtu", "junk.msh", "junk.vtk", "junk.inp", "junk.what"])
@@ -469,7 +455,7 @@ def test_unreadable_file_is_an_error_that_names_it(tmp_path, name):
     """On some of these files meshio calls sys.exit."""
     (tmp_path / name).write_text("no mesh at all\n")
     with pytest.raises(ValueError, match=name):
-        read_mesh(tmp_path / name)
+        fem.read_mesh(tmp_path / name)
 
 
 @pytest.mark.parametrize("flaw", BROKEN_MESHES)
@@ -477,7 +463,7 @@ def test_invalid_mesh_is_an_error_that_states_the_cause(tmp_path, flaw):
     message, points, cells = BROKEN_MESHES[flaw]
     path = write(tmp_path / "bad.vtu", np.asarray(points, float), **cells)
     with pytest.raises(ValueError, match=r"bad\.vtu") as error:
-        read_mesh(path)
+        fem.read_mesh(path)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -492,7 +478,7 @@ def test_errors_number_nodes_as_the_file_does(tmp_path, flaw):
     for name, nodes, factor in (("tight", points, 1), ("loose", loose, 2)):
         shifted = {kind: factor * np.asarray(t) + factor - 1 for kind, t in cells.items()}
         with pytest.raises(ValueError, match=name) as error:
-            read_mesh(write(tmp_path / f"{name}.vtu", np.asarray(nodes, float), **shifted))
+            fem.read_mesh(write(tmp_path / f"{name}.vtu", np.asarray(nodes, float), **shifted))
         text = str(error.value).split(name)[1]
         errors.append([int(n) for part in text.split(":")[2:] for n in numbers(part)])
     assert errors[0]
@@ -526,7 +512,7 @@ def warped(mesh: skfem.Mesh, size: float) -> skfem.Mesh:
 @pytest.mark.parametrize(("coarse", "fine"), [(1, 2), (2, 3), (1, 4)])
 def test_fine_cells_on_coarse_ones_are_an_error(cell, warp, coarse, fine):
     """All nodes that the other side lacks hang; on a warped plane tetrahedra have edges there."""
-    grid, dim = (rectangle, 2) if cell in ("quad", "triangle") else (box, 3)
+    grid, dim = (fem.rectangle, 2) if cell in ("quad", "triangle") else (fem.box, 3)
     second = grid([1.0] * dim, [fine + 1] * dim, cell)
     first = grid([1.0] * dim, [coarse + 1] * dim, cell)
     mesh = joined(first, type(second)(second.p + np.eye(dim)[:, :1], second.t))
@@ -539,7 +525,7 @@ def test_fine_cells_on_coarse_ones_are_an_error(cell, warp, coarse, fine):
 
 
 def test_sides_cut_along_the_other_diagonal_are_an_error():
-    first = box([1.0, 1.0, 1.0], [2, 2, 2], "tetra")
+    first = fem.box([1.0, 1.0, 1.0], [2, 2, 2], "tetra")
     fits = type(first)(np.stack([2 - first.p[0], first.p[1], first.p[2]]), first.t)
     check_mesh(joined(first, fits))
     crossed = type(first)(np.stack([2 - first.p[0], 1 - first.p[1], first.p[2]]), first.t)
@@ -552,7 +538,7 @@ def test_sides_cut_along_the_other_diagonal_are_an_error():
 @pytest.mark.parametrize("at", [50.0, 87.5])
 def test_a_layer_of_slivers_is_valid(cell, thin, at):
     """Inside of the beam and at its end."""
-    mesh = box([100.0, 25.0, 25.0], [9, 3, 3], cell)
+    mesh = fem.box([100.0, 25.0, 25.0], [9, 3, 3], cell)
     p = mesh.p.copy()
     p[0, p[0] == at] = 37.5 + 12.5 * thin if at == 50.0 else 100 - 12.5 * thin
     thinned = type(mesh)(p, mesh.t)
@@ -586,7 +572,7 @@ def test_folded_simplices_are_an_error(cell, seed, grid):
 
 
 def test_a_mesh_built_by_hand_may_not_have_nodes_without_a_cell():
-    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    mesh = fem.box([1.0, 1.0, 1.0], [2, 2, 2])
     with pytest.raises(ValueError, match="1 nodes belong to no cell: 0"):
         check_mesh(skfem.MeshHex(np.concatenate([[[9], [9], [9]], mesh.p], axis=1), mesh.t + 1))
 
@@ -594,7 +580,7 @@ def test_a_mesh_built_by_hand_may_not_have_nodes_without_a_cell():
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
 def test_a_hundred_thousand_nodes_can_be_checked(cell):
     """A comparison of all pairs would not end."""
-    mesh = box([1.0, 1.0, 1.0], [47, 47, 47], cell)
+    mesh = fem.box([1.0, 1.0, 1.0], [47, 47, 47], cell)
     assert check_mesh(mesh) is mesh
 
 
@@ -605,13 +591,13 @@ def test_vtu_of_several_pieces_is_an_error(tmp_path):
     start, end = text.index("<Piece"), text.index("</Piece>") + len("</Piece>")
     path.write_text(text[:end] + text[start:end] + text[end:])
     with pytest.raises(ValueError, match="several pieces"):
-        read_mesh(path)
+        fem.read_mesh(path)
 
 
 @pytest.mark.parametrize("kind", ["gmsh", "gmsh22", "vtu", "vtk", "vtk42", "abaqus"])
 def test_a_file_that_ends_too_early_is_an_error_and_meshio_keeps_silent(tmp_path, kind, capfd):
     """Cut anywhere; the last bytes of some formats mean nothing."""
-    mesh = box([1.0, 1.0, 1.0], [4, 3, 3], "tetra")
+    mesh = fem.box([1.0, 1.0, 1.0], [4, 3, 3], "tetra")
     suffix = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp"}.get(kind, kind[:3])
     path = tmp_path / f"whole.{suffix}"
     binary = {} if kind in ("abaqus", "vtu") else {"binary": False}
@@ -621,7 +607,7 @@ def test_a_file_that_ends_too_early_is_an_error_and_meshio_keeps_silent(tmp_path
     for part in np.linspace(0.0, 0.97, 4):
         path.write_bytes(text[: int(part * len(text))])
         with pytest.raises(ValueError, match=r"whole\.") as error:
-            read_mesh(path)
+            fem.read_mesh(path)
         assert "\n" not in str(error.value)
     assert capfd.readouterr() == ("", "")
 
@@ -629,12 +615,12 @@ def test_a_file_that_ends_too_early_is_an_error_and_meshio_keeps_silent(tmp_path
 @pytest.mark.parametrize(
     "mesh",
     [
-        box([2.0, 1.0, 1.0], [3, 2, 2]),
-        box([2.0, 1.0, 1.0], [3, 2, 2], "tetra"),
-        rectangle([2.0, 1.0], [3, 2]),
-        rectangle([2.0, 1.0], [3, 2], "triangle"),
-        skfem.MeshTet2.from_mesh(box([2.0, 1.0, 1.0], [3, 2, 2], "tetra")),
-        skfem.MeshHex2.from_mesh(box([2.0, 1.0, 1.0], [3, 2, 2])),
+        fem.box([2.0, 1.0, 1.0], [3, 2, 2]),
+        fem.box([2.0, 1.0, 1.0], [3, 2, 2], "tetra"),
+        fem.rectangle([2.0, 1.0], [3, 2]),
+        fem.rectangle([2.0, 1.0], [3, 2], "triangle"),
+        skfem.MeshTet2.from_mesh(fem.box([2.0, 1.0, 1.0], [3, 2, 2], "tetra")),
+        skfem.MeshHex2.from_mesh(fem.box([2.0, 1.0, 1.0], [3, 2, 2])),
     ],
     ids=lambda mesh: type(mesh).__name__,
 )
@@ -643,8 +629,8 @@ def test_save_and_load_give_the_mesh_and_its_fields_back(tmp_path, mesh, suffix)
     path = tmp_path / "new" / f"body{suffix}"
     nodes, dim = mesh.p.shape[1], mesh.dim()
     vector, scalar = np.arange(nodes * dim).reshape(nodes, dim) / 7, np.arange(nodes) / 3
-    write_mesh(path, mesh, {"displacement": vector, "energy": scalar})
-    again = read_mesh(path)
+    fem.write_mesh(path, mesh, {"displacement": vector, "energy": scalar})
+    again = fem.read_mesh(path)
     assert type(again) is type(mesh)
     assert np.array_equal(again.p, mesh.p)
     assert volumes(again) == pytest.approx(volumes(mesh), rel=1e-13)
@@ -656,14 +642,14 @@ def test_save_and_load_give_the_mesh_and_its_fields_back(tmp_path, mesh, suffix)
 
 
 EXACT = [
-    box([2.0, 1.0, 1.0], [3, 2, 3]),
-    box([2.0, 1.0, 1.0], [3, 2, 3], "tetra"),
-    rectangle([2.0, 1.0], [3, 2]),
-    rectangle([2.0, 1.0], [3, 2], "triangle"),
-    skfem.MeshTri2.from_mesh(rectangle([2.0, 1.0], [3, 2], "triangle")),
-    skfem.MeshQuad2.from_mesh(rectangle([2.0, 1.0], [3, 2])),
-    skfem.MeshTet2.from_mesh(box([2.0, 1.0, 1.0], [3, 2, 3], "tetra")),
-    skfem.MeshHex2.from_mesh(box([2.0, 1.0, 1.0], [3, 2, 3])),
+    fem.box([2.0, 1.0, 1.0], [3, 2, 3]),
+    fem.box([2.0, 1.0, 1.0], [3, 2, 3], "tetra"),
+    fem.rectangle([2.0, 1.0], [3, 2]),
+    fem.rectangle([2.0, 1.0], [3, 2], "triangle"),
+    skfem.MeshTri2.from_mesh(fem.rectangle([2.0, 1.0], [3, 2], "triangle")),
+    skfem.MeshQuad2.from_mesh(fem.rectangle([2.0, 1.0], [3, 2])),
+    skfem.MeshTet2.from_mesh(fem.box([2.0, 1.0, 1.0], [3, 2, 3], "tetra")),
+    skfem.MeshHex2.from_mesh(fem.box([2.0, 1.0, 1.0], [3, 2, 3])),
 ]
 
 
@@ -675,8 +661,8 @@ def test_a_mesh_that_is_saved_exactly_is_loaded_to_the_last_bit(tmp_path, mesh):
     mesh = type(mesh)(mesh.doflocs + shift, mesh.t)
     names = {'a<b&"c"\n =1': np.array([0, 3]), "größe": np.arange(2)}
     mesh = mesh.with_boundaries(names).with_subdomains({"half": np.arange(2), "none": []})
-    write_mesh_exactly(tmp_path / "mesh.vtu", mesh)
-    again = read_mesh(tmp_path / "mesh.vtu")
+    fem.write_mesh_exactly(tmp_path / "mesh.vtu", mesh)
+    again = fem.read_mesh(tmp_path / "mesh.vtu")
     assert type(again) is type(mesh)
     assert np.array_equal(again.t, mesh.t)
     assert np.array_equal(again.doflocs, mesh.doflocs)

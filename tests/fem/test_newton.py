@@ -13,44 +13,28 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem import (
-    LinearSolver,
-    Load,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Solution,
-    Status,
-    Traction,
-    YoungPoissonMaterial,
-    box,
-    evaluate_solution,
-    installed_backends,
-    solve,
-)
+from dpl import fem
 from dpl.fem.linear import BACKENDS, SuperLU
 from dpl.fem.linear.banded import BandedCholesky
 from dpl.fem.solvers.factor_reuse import forcing_term
 
-SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
+SVK, NH = fem.SaintVenantKirchhoff(0.3), fem.NeoHookeanLn(0.3)
 LENGTH = 100.0  # of the paper's beam [m]
 
 
-def load_of(force: torch.Tensor) -> Load:
+def load_of(force: torch.Tensor) -> fem.Load:
     """Return a load of the beam's stiffness."""
-    return Load(force, torch.full((len(force),), 4500.0))
+    return fem.Load(force, torch.full((len(force),), 4500.0))
 
 
-def newton(problem: Problem, **options) -> Newton:
+def newton(problem: fem.Problem, **options) -> fem.Newton:
     """Return the solver with the backend that every machine has."""
-    return Newton(problem, **{"linear": "superlu", **options})
+    return fem.Newton(problem, **{"linear": "superlu", **options})
 
 
-def differing(one: Solution, other: Solution) -> list[str]:
+def differing(one: fem.Solution, other: fem.Solution) -> list[str]:
     """Return in what two solutions differ, if only by a bit; the time they took does not count."""
-    pairs = zip(Solution._fields, one, other, strict=True)
+    pairs = zip(fem.Solution._fields, one, other, strict=True)
     return [name for name, a, b in pairs if name != "seconds" and not torch.equal(a, b)]
 
 
@@ -101,7 +85,7 @@ def test_beam_bends_as_tabulated(
     """The paper's beam to 1e-6, and the iterations of plain Newton (independent code)."""
     problem = beam(law, *cells, cell=cell, degree=degree)
     backend = "auto" if cells[0] * degree > 16 else "superlu"
-    answer = solve(
+    answer = fem.solve(
         newton(problem, linear=backend, mixed_integration=mixed), load_of(pull(problem, q))
     )
     assert answer.converged.all()
@@ -127,7 +111,7 @@ def test_beam_of_tetrahedra_bends_as_tabulated(beam, pull, corner, cells, degree
     """The paper's beam in six Kuhn tetrahedra per cell; another diagonal: within 0.5 %."""
     for law, q, z in zip([SVK, SVK, SVK, NH], [5, 20, 40, 40], printed, strict=True):
         problem = beam(law, *cells, cell="tetra", degree=degree)
-        answer = solve(newton(problem, linear="auto"), load_of(pull(problem, q)))
+        answer = fem.solve(newton(problem, linear="auto"), load_of(pull(problem, q)))
         end = corner(problem, answer.displacement) * LENGTH
         assert answer.converged.all()
         assert end[2].item() == pytest.approx(z, rel=5e-3)
@@ -145,7 +129,7 @@ def test_one_step_squares_the_error(law, beam, pull):
     """Half the error in the guess leaves a quarter of the error after one iteration."""
     problem = beam(law)
     load = load_of(pull(problem, 20.0))
-    answer = solve(newton(problem, tol=1e-12), load).displacement
+    answer = fem.solve(newton(problem, tol=1e-12), load).displacement
     left = []
     for error in (1e-3, 5e-4, 2.5e-4):
         states = newton(problem, mixed_integration=False).iterate(load, guess=(1 + error) * answer)
@@ -166,9 +150,9 @@ def test_one_step_squares_the_error(law, beam, pull):
 )
 def test_answer_does_not_depend_on_the_size_of_the_body(pull, corner, law, printed, length):
     """The same u/L in six iterations at q/E = 20/4500, for any E and L."""
-    mesh = box([length, length / 4, length / 4], [9, 3, 3])
-    problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
-    answer = solve(
+    mesh = fem.box([length, length / 4, length / 4], [9, 3, 3])
+    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"))
+    answer = fem.solve(
         newton(problem, mixed_integration=False, factor_reuse_tol=0.0), load_of(pull(problem, 20.0))
     )
     assert problem.length == pytest.approx(length)
@@ -181,8 +165,8 @@ def test_tiny_loads_converge_to_the_linear_answer(law, beam, pull, corner):
     problem, loads, deviations = beam(law), (1e-2, 1e-4, 1e-6), []
     for q in loads:
         load = load_of(pull(problem, q))
-        answer = solve(newton(problem), load)
-        linear = solve(LinearSolver(problem, linear="superlu"), load)
+        answer = fem.solve(newton(problem), load)
+        linear = fem.solve(fem.LinearSolver(problem, linear="superlu"), load)
         assert answer.converged.all()
         assert answer.iterations.item() <= 2
         ratio = corner(problem, answer.displacement)[2] / corner(problem, linear.displacement)[2]
@@ -210,7 +194,7 @@ def test_no_load_costs_nothing(law, beam, monkeypatch):
 def test_four_times_the_training_load_converges(beam, pull, mixed, law, deepest, volume):
     """Stress cases T1 and T3, q = 80 on hex8 16 x 4 x 4."""
     problem = beam(law, 16, 4)
-    answer = solve(newton(problem, mixed_integration=mixed), load_of(pull(problem, 80.0)))
+    answer = fem.solve(newton(problem, mixed_integration=mixed), load_of(pull(problem, 80.0)))
     assert answer.converged.all()
     assert answer.volume_ratio.item() == pytest.approx(volume, abs=5e-4)
     if deepest is not None:
@@ -239,9 +223,9 @@ def test_neo_hookean_beam_answers_any_load(beam, pull, mixed, q, deepest, volume
 @pytest.mark.slow
 def test_slender_beam_needs_load_steps_and_gets_there(pull):
     """Stress case T5: NH-ln 20 x 1 x 1, nu = 0, hex27, P L^2 / EI = 1: w / L = .302130893."""
-    mesh = box([20.0, 1.0, 1.0], [21, 2, 2])
-    problem = Problem.build(mesh, NeoHookeanLn(0.0), fixed=Plane(0, "min"), degree=2)
-    answer = solve(newton(problem, linear="auto"), load_of(pull(problem, 4500.0 / 12 / 400)))
+    mesh = fem.box([20.0, 1.0, 1.0], [21, 2, 2])
+    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(0.0), fixed=fem.Plane(0, "min"), degree=2)
+    answer = fem.solve(newton(problem, linear="auto"), load_of(pull(problem, 4500.0 / 12 / 400)))
     assert answer.converged.all()
     end = problem.points[:, 0] == problem.points[:, 0].max()
     force = pull(problem, 1.0)[0, end, 2]
@@ -249,16 +233,16 @@ def test_slender_beam_needs_load_steps_and_gets_there(pull):
     assert -sag.item() == pytest.approx(0.302130893, rel=1e-3)
 
 
-def check_defeat(problem: Problem, solver: Newton, force: torch.Tensor) -> None:
+def check_defeat(problem: fem.Problem, solver: fem.Newton, force: torch.Tensor) -> None:
     """Assert that a load without an answer ends as stress case T2 requires."""
     for state in solver.iterate(load_of(force)):
         assert state.volume_ratio.item() > 0
         assert state.residual.isfinite().all()
         assert not state.converged.any()
-    assert state.status.item() == Status.NO_VALID_EQUILIBRIUM
+    assert state.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
     factor = state.load_factor.item()
     assert 0 < factor < 1
-    rest = evaluate_solution(
+    rest = fem.evaluate_solution(
         problem, state.displacement, load_of(factor * force), solver.intermediate_tol
     )
     assert rest.converged.all()
@@ -276,8 +260,8 @@ def test_load_without_an_answer_is_reported_with_the_part_that_has_one(beam, pul
 @pytest.mark.parametrize("most", [3, 4])
 def test_a_load_step_is_at_most_twice_the_one_before(most):
     """With few iterations a step a load is applied in many; those that succeed are doubled."""
-    problem = Problem.build(box([4.0, 1.0, 1.0], [9, 3, 3]), NH, fixed=Plane(0, "min"))
-    force = Traction(Plane(0, "max"), [0.0, 0.0, -2e-2]).on(problem)[None]
+    problem = fem.Problem.build(fem.box([4.0, 1.0, 1.0], [9, 3, 3]), NH, fixed=fem.Plane(0, "min"))
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -2e-2]).on(problem)[None]
     states = list(newton(problem, max_iter=most, mixed_integration=False).iterate(load_of(force)))
     assert states[-1].converged.all()
     factors = list(dict.fromkeys(state.load_factor.item() for state in states))
@@ -287,7 +271,7 @@ def test_a_load_step_is_at_most_twice_the_one_before(most):
     assert any(following == 2 * part for part, following in pairwise(parts))
     assert factors[0] == 0
     assert factors[-1] == 1
-    whole = solve(newton(problem), load_of(force))
+    whole = fem.solve(newton(problem), load_of(force))
     assert_close(states[-1].displacement, whole.displacement, rtol=0, atol=1e-6)
 
 
@@ -301,16 +285,16 @@ def test_load_without_an_answer_on_the_finer_mesh_is_reported(beam, pull, mixed,
 
 def test_squeezed_block_fails_where_its_law_softens(mixed):
     """An SVK bar has a solution up to |P| = E / (3 sqrt 3), and none beyond (closed form)."""
-    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    mesh = fem.box([1.0, 1.0, 1.0], [2, 2, 2])
     slides = mesh.p.T == 0  # each coordinate plane holds its own normal
-    problem = Problem.build(mesh, SVK, fixed=slides, length=1.0)
+    problem = fem.Problem.build(mesh, SVK, fixed=slides, length=1.0)
     force = torch.zeros(1, 8, 3, dtype=torch.float64)
     force[0, torch.from_numpy(mesh.p[0] == 1), 0] = -1 / 4
     limit = 1 / (3 * math.sqrt(3))
-    below = solve(newton(problem, mixed_integration=mixed), load_of(0.99 * limit * force))
+    below = fem.solve(newton(problem, mixed_integration=mixed), load_of(0.99 * limit * force))
     assert below.converged.all()
     assert below.displacement[0, :, 0].min().item() + 1 > 1 / math.sqrt(3)
-    above = solve(newton(problem, mixed_integration=mixed), load_of(1.05 * limit * force))
+    above = fem.solve(newton(problem, mixed_integration=mixed), load_of(1.05 * limit * force))
     assert not above.converged.any()
     assert above.volume_ratio.item() > 0
     assert above.load_factor.item() == pytest.approx(1 / 1.05, abs=0.02)
@@ -321,10 +305,10 @@ def test_batch_solves_like_its_members(law, beam, pull):
     problem = beam(law, 4, 1)
     force = torch.cat([pull(problem, q) for q in (0.0, 1e-3, 5.0, 40.0, 2000.0)])
     solver = newton(problem, min_load_step=2.0**-4)
-    batch = solve(solver, load_of(force))
+    batch = fem.solve(solver, load_of(force))
     for k, alone in enumerate(force):
-        member = solve(solver, load_of(alone[None]))
-        assert differing(Solution(*(value[k, None] for value in batch)), member) == []
+        member = fem.solve(solver, load_of(alone[None]))
+        assert differing(fem.Solution(*(value[k, None] for value in batch)), member) == []
     assert len(set(batch.iterations.tolist())) == 5
 
 
@@ -337,17 +321,19 @@ def test_states_are_yielded_from_the_start_one_by_one(law, beam, pull):
     assert [s.converged.item() for s in states] == [False] * (len(states) - 1) + [True]
     assert [s.load_factor.item() for s in states] == [0.0] * (len(states) - 1) + [1.0]
     for state in states:
-        again = evaluate_solution(problem, state.displacement, load_of(pull(problem, 20.0)), 1e-8)
+        again = fem.evaluate_solution(
+            problem, state.displacement, load_of(pull(problem, 20.0)), 1e-8
+        )
         assert torch.equal(again.residual, state.residual)
         assert torch.equal(again.volume_ratio, state.volume_ratio)
 
 
 @pytest.fixture
-def wrong(law, beam, pull) -> tuple[Problem, Load, Solution]:
+def wrong(law, beam, pull) -> tuple[fem.Problem, fem.Load, fem.Solution]:
     """A problem, its load and its answer from zero."""
     problem = beam(law)
     load = load_of(pull(problem, 20.0))
-    return problem, load, solve(newton(problem), load)
+    return problem, load, fem.solve(newton(problem), load)
 
 
 @pytest.mark.parametrize("kind", ["nan", "one nan", "infinite", "inverted", "huge"])
@@ -411,8 +397,8 @@ def test_exact_guess_costs_nothing(wrong, monkeypatch):
     """No assembly and no factorisation."""
     problem, load, answer = wrong
     monkeypatch.setattr(SuperLU, "factorise", None)
-    monkeypatch.setattr(Problem, "tangent", None)
-    monkeypatch.setattr(Problem, "linearise", None)
+    monkeypatch.setattr(fem.Problem, "tangent", None)
+    monkeypatch.setattr(fem.Problem, "linearise", None)
     states = list(newton(problem).iterate(load, guess=answer.displacement))
     assert len(states) == 1
     assert states[0].converged.all()
@@ -438,7 +424,7 @@ def test_guess_of_the_held_nodes_is_not_believed(wrong):
 def test_members_use_their_own_guess(law, beam, pull):
     problem = beam(law, 4, 1)
     load = load_of(torch.cat([pull(problem, q) for q in (5.0, 20.0, 40.0)]))
-    answer = solve(newton(problem), load)
+    answer = fem.solve(newton(problem), load)
     guess = answer.displacement.clone()
     guess[1] = math.nan
     *_, end = newton(problem).iterate(load, guess=guess)
@@ -463,7 +449,7 @@ def test_force_of_another_kind_or_shape_is_an_error_that_says_so(beam, pull, cha
     solver, load = newton(problem), load_of(change(pull(problem, 20.0)))
     for each in (solver, solver.linear_solver):
         with pytest.raises(ValueError, match=rf"force\.{message} = "):
-            solve(each, load)
+            fem.solve(each, load)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
@@ -475,7 +461,7 @@ def test_force_that_is_no_number_has_no_answer_even_on_a_held_node(beam, pull, b
     load.force[0, held, 0] = bad
     solver = newton(problem)
     for each in (solver, solver.linear_solver):
-        assert not solve(each, load).converged.any()
+        assert not fem.solve(each, load).converged.any()
 
 
 @pytest.mark.parametrize(
@@ -498,24 +484,24 @@ def test_force_that_is_no_number_has_no_answer_even_on_a_held_node(beam, pull, b
 )
 def test_option_out_of_range_is_an_error_that_names_it(beam, option):
     with pytest.raises(ValueError, match=next(iter(option))):
-        Newton(beam(NH, 4, 1), **option)
+        fem.Newton(beam(NH, 4, 1), **option)
 
 
 def test_unknown_backend_is_an_error(beam, pull):
     problem = beam(NH, 4, 1)
     with pytest.raises(ValueError, match="linear = "):
-        solve(newton(problem, linear="umfpack"), load_of(pull(problem, 1.0)))
+        fem.solve(newton(problem, linear="umfpack"), load_of(pull(problem, 1.0)))
 
 
 def test_rest_state_is_factorised_once_for_all_loads(law, beam, pull, counted):
     """The factor of K(0) belongs to the scene and is not counted."""
     problem = beam(law)
     solver, load = newton(problem, factor_reuse_tol=0.0), load_of(pull(problem, 20.0))
-    first = solve(solver, load)
+    first = fem.solve(solver, load)
     assert first.factorisations.item() == first.iterations.item() - 1
     assert len(counted) == first.iterations.item()
     counted.clear()
-    second = solve(solver, load)
+    second = fem.solve(solver, load)
     assert len(counted) == second.factorisations.item() == first.factorisations.item()
     assert torch.equal(first.displacement, second.displacement)
 
@@ -524,7 +510,7 @@ def test_load_whose_linear_answer_will_do_costs_no_factorisation(law, beam, pull
     problem = beam(law)
     solver = newton(problem)
     for q in (1e-10, 2e-10, 3e-10):
-        answer = solve(solver, load_of(pull(problem, q)))
+        answer = fem.solve(solver, load_of(pull(problem, q)))
         assert answer.converged.all()
         assert answer.iterations.item() == 1
         assert answer.factorisations.item() == 0
@@ -535,7 +521,7 @@ def test_linear_answer_is_the_first_iterate(law, beam, pull):
     problem = beam(law)
     load = load_of(pull(problem, 5.0))
     states = list(newton(problem).iterate(load))
-    linear = solve(LinearSolver(problem, linear="superlu"), load)
+    linear = fem.solve(fem.LinearSolver(problem, linear="superlu"), load)
     assert torch.equal(linear.displacement, states[1].displacement)
     assert torch.equal(linear.residual, states[1].residual)
     assert not linear.converged.any()
@@ -544,11 +530,11 @@ def test_linear_answer_is_the_first_iterate(law, beam, pull):
 
 @pytest.mark.parametrize("name", [name for name in BACKENDS if name != "superlu"])
 def test_backends_give_the_same_answer(law, beam, pull, name):
-    if name not in installed_backends():
+    if name not in fem.installed_backends():
         pytest.skip(f"{name} is not installed")
     problem = beam(law)
     load = load_of(pull(problem, 20.0))
-    first, second = (solve(newton(problem, linear=one), load) for one in ("superlu", name))
+    first, second = (fem.solve(newton(problem, linear=one), load) for one in ("superlu", name))
     assert second.converged.all()
     more = second.iterations.item() - first.iterations.item()  # iterative solves are less exact
     assert more == 0 or (name in ("band32", "cg") and abs(more) == 1)
@@ -558,9 +544,9 @@ def test_backends_give_the_same_answer(law, beam, pull, name):
 def test_solver_without_pardiso_solves_the_same(beam, pull, monkeypatch):
     problem = beam(NH, 4, 1)
     load = load_of(pull(problem, 20.0))
-    expected = solve(newton(problem), load)
+    expected = fem.solve(newton(problem), load)
     monkeypatch.setattr("dpl.fem.linear.backends.installed_backends", lambda: ["superlu"])
-    assert torch.equal(solve(Newton(problem), load).displacement, expected.displacement)
+    assert torch.equal(fem.solve(fem.Newton(problem), load).displacement, expected.displacement)
 
 
 @pytest.mark.parametrize("q", [5.0, 20.0, 40.0])
@@ -569,7 +555,7 @@ def test_mixed_points_find_the_same_answer_in_fewer_iterations(law, beam, pull, 
     problem = beam(law)
     load = load_of(pull(problem, q))
     plain, mixed = (
-        solve(newton(problem, tol=1e-10, mixed_integration=m), load) for m in (False, True)
+        fem.solve(newton(problem, tol=1e-10, mixed_integration=m), load) for m in (False, True)
     )
     assert plain.converged.all()
     assert mixed.converged.all()
@@ -578,46 +564,46 @@ def test_mixed_points_find_the_same_answer_in_fewer_iterations(law, beam, pull, 
 
 
 @dataclass(frozen=True)
-class EnergyOnly(YoungPoissonMaterial):
+class EnergyOnly(fem.YoungPoissonMaterial):
     """The Saint Venant-Kirchhoff law as a user would write it: its energy alone."""
 
     def energy(self, H):
         """Return the energy density."""
-        return SaintVenantKirchhoff.energy(self, H)
+        return fem.SaintVenantKirchhoff.energy(self, H)
 
 
 def test_law_that_is_only_an_energy_solves_like_its_closed_form(beam, pull):
     problem, short = beam(SVK, 4, 1), beam(EnergyOnly(0.3), 4, 1)
     load = load_of(pull(problem, 20.0))
-    answer, again = solve(newton(problem), load), solve(newton(short), load)
+    answer, again = fem.solve(newton(problem), load), fem.solve(newton(short), load)
     assert again.converged.all()
     assert_close(again.displacement, answer.displacement, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [Newton, LinearSolver])
+@pytest.mark.parametrize("kind", [fem.Newton, fem.LinearSolver])
 def test_pickled_solver_answers_the_same(beam, pull, kind):
     problem = beam(NH, 4, 1)
     load = load_of(pull(problem, 5.0))
     solver = kind(problem, tol=1e-9, linear="superlu")
-    answer = solve(solver, load)
+    answer = fem.solve(solver, load)
     copy = pickle.loads(pickle.dumps(solver))  # after factors have been made
     assert copy.tol == 1e-9
-    assert torch.equal(solve(copy, load).displacement, answer.displacement)
+    assert torch.equal(fem.solve(copy, load).displacement, answer.displacement)
 
 
 def test_moved_supports_pull_the_body_along(law, mixed):
     """A bar stretched by its ends has the closed-form lateral stretch at 1.5."""
-    mesh = box([1.0, 1.0, 1.0], [3, 3, 3])
+    mesh = fem.box([1.0, 1.0, 1.0], [3, 3, 3])
     held = mesh.p.T == 0
     held[:, 0] |= mesh.p[0] == 1
     given = np.where(mesh.p[0] == 1, 0.5, 0.0)[:, None] * np.array([1, 0, 0])
-    problem = Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0)
+    problem = fem.Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0)
     none = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    answer = solve(newton(problem, tol=1e-12, mixed_integration=mixed), load_of(none))
+    answer = fem.solve(newton(problem, tol=1e-12, mixed_integration=mixed), load_of(none))
     assert answer.converged.all()
     assert answer.load_factor.item() == 1
     far = problem.points.sum(dim=1).argmax()
-    lateral = {SaintVenantKirchhoff: 0.79056942, NeoHookeanLn: 0.88017459}[type(law)]
+    lateral = {fem.SaintVenantKirchhoff: 0.79056942, fem.NeoHookeanLn: 0.88017459}[type(law)]
     end = 1 + answer.displacement[0, far]
     assert end.tolist() == pytest.approx([1.5, lateral, lateral], abs=6e-9)
 
@@ -626,9 +612,9 @@ def test_judge_believes_nothing(law, beam, pull):
     problem = beam(law, 4, 1)
     load = load_of(torch.cat([pull(problem, 20.0)] * 3))
     claims = torch.zeros_like(load.force)
-    claims[1] = solve(newton(problem), load_of(load.force[:1])).displacement[0]
+    claims[1] = fem.solve(newton(problem), load_of(load.force[:1])).displacement[0]
     claims[2] = math.nan
-    verdict = evaluate_solution(problem, claims, load, 1e-8, iterations=3)
+    verdict = fem.evaluate_solution(problem, claims, load, 1e-8, iterations=3)
     assert verdict.converged.tolist() == [False, True, False]
     assert verdict.load_factor.tolist() == [0, 1, 0]
     assert verdict.iterations.tolist() == [3, 3, 3]
@@ -638,19 +624,21 @@ def test_judge_believes_nothing(law, beam, pull):
 
 
 @pytest.fixture(scope="module")
-def column() -> Problem:
+def column() -> fem.Problem:
     """A column of 10 x 1 x 1 m: ten hex27 of SVK, nu = 0."""
-    mesh = box([10.0, 1.0, 1.0], [11, 2, 2])
-    return Problem.build(mesh, SaintVenantKirchhoff(0.0), fixed=Plane(0, "min"), degree=2)
+    mesh = fem.box([10.0, 1.0, 1.0], [11, 2, 2])
+    return fem.Problem.build(
+        mesh, fem.SaintVenantKirchhoff(0.0), fixed=fem.Plane(0, "min"), degree=2
+    )
 
 
 @pytest.fixture
-def squeezed(column) -> Callable[[float], Solution]:
+def squeezed(column) -> Callable[[float], fem.Solution]:
     """Solutions under an axial dead load P, E = 1000 Pa."""
 
-    def squeezed(P: float) -> Solution:
-        force = Traction(Plane(0, "max"), [-P / 1000, 0.0, 0.0]).on(column)[None]
-        return solve(newton(column), load_of(force))
+    def squeezed(P: float) -> fem.Solution:
+        force = fem.Traction(fem.Plane(0, "max"), [-P / 1000, 0.0, 0.0]).on(column)[None]
+        return fem.solve(newton(column), load_of(force))
 
     return squeezed
 
@@ -659,7 +647,7 @@ def test_column_below_its_critical_load_is_stable(squeezed):
     """K becomes singular at P = 2.039763 (independent code)."""
     answer = squeezed(2.03)
     assert answer.stable.all()
-    assert answer.status.item() == Status.CONVERGED
+    assert answer.status.item() == fem.Status.CONVERGED
     assert answer.negative_pivots.item() == 0
 
 
@@ -668,13 +656,13 @@ def test_straight_column_beyond_its_critical_load_is_flagged(squeezed):
     answer = squeezed(2.5)
     assert answer.converged.all()
     assert not answer.stable.any()
-    assert answer.status.item() == Status.UNSTABLE
+    assert answer.status.item() == fem.Status.UNSTABLE
     assert answer.negative_pivots.item() == 2
     assert 10 * answer.displacement[..., 0].min().item() == pytest.approx(-0.02509, abs=5e-6)
 
 
 def test_status_reads_as_words():
-    assert [str(one) for one in Status] == [
+    assert [str(one) for one in fem.Status] == [
         *("converged", "unstable", "no valid equilibrium", "not converged"),
     ]
 
@@ -682,8 +670,8 @@ def test_status_reads_as_words():
 @pytest.mark.parametrize("budget", [1, 3])
 def test_load_is_given_up_where_the_budget_ends(beam, pull, budget):
     problem = beam(NH)
-    answer = solve(newton(problem, max_total_iter=budget), load_of(pull(problem, 40.0)))
-    assert answer.status.item() == Status.NOT_CONVERGED
+    answer = fem.solve(newton(problem, max_total_iter=budget), load_of(pull(problem, 40.0)))
+    assert answer.status.item() == fem.Status.NOT_CONVERGED
     assert answer.iterations.item() == budget
     assert not answer.converged.any()
     assert answer.load_factor.item() == 0
@@ -692,9 +680,9 @@ def test_load_is_given_up_where_the_budget_ends(beam, pull, budget):
 def test_answer_of_the_last_iteration_of_the_budget_counts(beam, pull):
     problem = beam(NH)
     load = load_of(pull(problem, 20.0))
-    answer = solve(newton(problem), load)
+    answer = fem.solve(newton(problem), load)
     assert answer.converged.all()
-    spent = solve(newton(problem, max_total_iter=answer.iterations.item()), load)
+    spent = fem.solve(newton(problem, max_total_iter=answer.iterations.item()), load)
     assert differing(spent, answer) == []
 
 
@@ -711,14 +699,14 @@ def test_time_goes_on(beam, pull):
 )
 def test_slivers_end_where_rounding_ends_them(pull, corner, part, deepest):
     """Stress case T11: the plane x = 50 moved to 37.5 + 12.5 eps."""
-    mesh = box([LENGTH, 25.0, 25.0], [9, 3, 3])
+    mesh = fem.box([LENGTH, 25.0, 25.0], [9, 3, 3])
     points = mesh.p.copy()
     points[0, points[0] == 50.0] = 37.5 + 12.5 * part
     with pytest.warns(UserWarning, match="aspect ratio"):
-        problem = Problem.build(type(mesh)(points, mesh.t), SVK, fixed=Plane(0, "min"))
+        problem = fem.Problem.build(type(mesh)(points, mesh.t), SVK, fixed=fem.Plane(0, "min"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        answer = solve(newton(problem), load_of(pull(problem, 20.0)))
+        answer = fem.solve(newton(problem), load_of(pull(problem, 20.0)))
     reported = any("rounding allows no less" in str(w.message) for w in caught)
     assert reported == bool(answer.residual > 1e-8) == (part == 1e-8)
     assert answer.converged.all()
@@ -739,14 +727,14 @@ def test_linear_solves_are_as_exact_as_eisenstat_and_walker_ask():
 
 def test_stability_is_not_known_before_newton_ends(beam, pull):
     problem = beam(NH, 4, 1)
-    states = list(Newton(problem, linear="superlu").iterate(load_of(pull(problem, 20.0))))
+    states = list(fem.Newton(problem, linear="superlu").iterate(load_of(pull(problem, 20.0))))
     assert [int(state.negative_pivots) for state in states[:-1]] == [-1] * (len(states) - 1)
     assert int(states[-1].negative_pivots) == 0
 
 
 def test_the_solver_of_another_poissons_ratio_shares_what_does_not_depend_on_it(beam, pull):
-    problem = beam(NeoHookeanLn([0.2, 0.4]), 4, 1)
-    newton = Newton(problem, linear="superlu", tol=1e-9)
+    problem = beam(fem.NeoHookeanLn([0.2, 0.4]), 4, 1)
+    newton = fem.Newton(problem, linear="superlu", tol=1e-9)
     ratio = torch.tensor([[0.25]], dtype=torch.float64)
     clone = newton.with_parameters(ratio)
     assert clone.tol == 1e-9
@@ -760,15 +748,15 @@ def test_the_solver_of_another_poissons_ratio_shares_what_does_not_depend_on_it(
 @pytest.mark.parametrize("linear", ["band", "band32", "superlu"])
 def test_a_guess_with_an_indefinite_tangent_is_abandoned_if_wanted(linear, monkeypatch):
     """A beam compressed by 40 %: its tangent has negative eigenvalues, those of buckling."""
-    problem = Problem.build(
-        box([4.0, 1.0, 1.0], [9, 3, 3]), NeoHookeanLn(0.3), fixed=Plane(0, "min")
+    problem = fem.Problem.build(
+        fem.box([4.0, 1.0, 1.0], [9, 3, 3]), fem.NeoHookeanLn(0.3), fixed=fem.Plane(0, "min")
     )
-    force = Traction(Plane(0, "max"), [0.0, 0.0, 1e-3]).on(problem)
-    load = Load(force[None], torch.ones(1, dtype=torch.float64))
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, 1e-3]).on(problem)
+    load = fem.Load(force[None], torch.ones(1, dtype=torch.float64))
     guess = torch.zeros(1, *problem.shape, dtype=torch.float64)
     guess[..., 0] = -0.4 * (problem.points[:, 0] - problem.points[:, 0].min())
-    exact = solve(Newton(problem, linear=linear), load)
-    newton = Newton(problem, linear=linear, abandon_indefinite_guess=True)
+    exact = fem.solve(fem.Newton(problem, linear=linear), load)
+    newton = fem.Newton(problem, linear=linear, abandon_indefinite_guess=True)
     if linear != "superlu":  # bands factorise no indefinite matrix themselves
         refused = property(lambda backend: pytest.fail("an indefinite tangent was factorised"))
         monkeypatch.setattr(BandedCholesky, "other", refused)

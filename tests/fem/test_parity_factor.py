@@ -5,29 +5,20 @@ import pytest
 import torch
 from scipy.linalg import norm
 
-from dpl.fem import (
-    DirichletBC,
-    LinearSolver,
-    NeoHookeanLn,
-    Plane,
-    Problem,
-    RobinBC,
-    box,
-    rectangle,
-)
+from dpl import fem
 from dpl.fem.linear.banded import BandedFactor
 from dpl.fem.solvers.parity_factor import ParityFactor
 
-NH = NeoHookeanLn(0.3)
-LEFT = Plane(0, "min")
+NH = fem.NeoHookeanLn(0.3)
+LEFT = fem.Plane(0, "min")
 BODIES = {
-    "beam with a square section": (box([4.0, 1.0, 1.0], [9, 4, 4]), {}, 4),
-    "beam with a rectangular section": (box([4.0, 2.0, 1.0], [9, 4, 3]), {}, 4),
-    "quadratic beam": (box([4.0, 1.0, 1.0], [4, 3, 3]), {"degree": 2}, 4),
-    "plate": (rectangle([4.0, 1.0], [13, 9]), {}, 2),
+    "beam with a square section": (fem.box([4.0, 1.0, 1.0], [9, 4, 4]), {}, 4),
+    "beam with a rectangular section": (fem.box([4.0, 2.0, 1.0], [9, 4, 3]), {}, 4),
+    "quadratic beam": (fem.box([4.0, 1.0, 1.0], [4, 3, 3]), {"degree": 2}, 4),
+    "plate": (fem.rectangle([4.0, 1.0], [13, 9]), {}, 2),
     "beam on a foundation": (
-        box([4.0, 1.0, 1.0], [9, 4, 4]),
-        {"supports": [DirichletBC(LEFT), RobinBC(Plane(2, "min"), 0.1)]},
+        fem.box([4.0, 1.0, 1.0], [9, 4, 4]),
+        {"supports": [fem.DirichletBC(LEFT), fem.RobinBC(fem.Plane(2, "min"), 0.1)]},
         2,
     ),
 }
@@ -37,8 +28,8 @@ BODIES = {
 def body(request):
     """Return the linear solver of a symmetric body, and the number of its reflections."""
     mesh, options, count = BODIES[request.param]
-    options = {"supports": [DirichletBC(LEFT)], **options}
-    return LinearSolver(Problem.build(mesh, NH, **options), linear="band"), count
+    options = {"supports": [fem.DirichletBC(LEFT)], **options}
+    return fem.LinearSolver(fem.Problem.build(mesh, NH, **options), linear="band"), count
 
 
 def right_hand_sides(size):
@@ -73,18 +64,18 @@ def test_the_factor_is_symmetric(body):
 
 
 def test_a_body_without_reflections_has_one_factor():
-    mesh = box([4.0, 1.0, 1.0], [9, 3, 3])
+    mesh = fem.box([4.0, 1.0, 1.0], [9, 3, 3])
     x, y, z = mesh.p
     crooked = type(mesh)(np.array([x, y + 0.1 * x**2, z + 0.2 * x]), mesh.t)
-    solver = LinearSolver(Problem.build(crooked, NH, fixed=LEFT), linear="band")
+    solver = fem.LinearSolver(fem.Problem.build(crooked, NH, fixed=LEFT), linear="band")
     assert isinstance(solver.float32_factor, BandedFactor)
 
 
 def test_other_parameters_than_the_reference_have_one_factor():
     """A factor for one load is not used often enough to pay for the factors by parity."""
-    law = NeoHookeanLn([0.2, 0.4])
-    problem = Problem.build(box([4.0, 1.0, 1.0], [9, 4, 4]), law, fixed=LEFT)
-    solver = LinearSolver(problem, linear="band")
+    law = fem.NeoHookeanLn([0.2, 0.4])
+    problem = fem.Problem.build(fem.box([4.0, 1.0, 1.0], [9, 4, 4]), law, fixed=LEFT)
+    solver = fem.LinearSolver(problem, linear="band")
     clone = solver.with_parameters(torch.tensor([[0.25]], dtype=torch.float64))
     right = np.random.default_rng(0).standard_normal(problem.pattern.size)
     for one, kind in ((solver.reference, ParityFactor), (clone, BandedFactor)):

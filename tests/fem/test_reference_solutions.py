@@ -8,43 +8,26 @@ import pytest
 import torch
 from torch import Tensor
 
-from dpl.fem import (
-    LinearSolver,
-    Load,
-    Material,
-    NeoHookeanIsoK4,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Solution,
-    Status,
-    Traction,
-    box,
-    eigenmodes,
-    rectangle,
-    solve,
-)
+from dpl import fem
 
 # these benchmarks are about elements that lock
 pytestmark = pytest.mark.filterwarnings("ignore:linear .* lock")
 
-SVK, NH, K4 = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3), NeoHookeanIsoK4(0.3)
+SVK, NH, K4 = fem.SaintVenantKirchhoff(0.3), fem.NeoHookeanLn(0.3), fem.NeoHookeanIsoK4(0.3)
 
 
-def load_of(force: Tensor) -> Load:
+def load_of(force: Tensor) -> fem.Load:
     """Return nodal forces (N, D) [-] as a load of one member; no answer depends on its modulus."""
-    return Load(force[None], torch.ones(1, dtype=torch.float64))
+    return fem.Load(force[None], torch.ones(1, dtype=torch.float64))
 
 
-def resumed(problem: Problem, force: Tensor, guess: Tensor | None, **options) -> Solution:
+def resumed(problem: fem.Problem, force: Tensor, guess: Tensor | None, **options) -> fem.Solution:
     """Return the answer that Newton reaches from a guess."""
-    *_, last = Newton(problem, **options).iterate(load_of(force), guess=guess)
+    *_, last = fem.Newton(problem, **options).iterate(load_of(force), guess=guess)
     return last
 
 
-def node_at(problem: Problem, *place: float) -> int:
+def node_at(problem: fem.Problem, *place: float) -> int:
     """Return the number of the node at a place [m], one coordinate for each of the first axes."""
     given = torch.tensor(place, dtype=torch.float64) / problem.length
     distance = (problem.points[:, : len(place)] - given).norm(dim=1)
@@ -62,15 +45,15 @@ CARIBOU = [
 ]
 
 
-def caribou(degree: int) -> tuple[Problem, Tensor]:
+def caribou(degree: int) -> tuple[fem.Problem, Tensor]:
     """Return the beam 15 x 15 x 80 along z of Caribou's regression test, and its whole load."""
-    mesh = box([15.0, 15.0, 80.0], [3, 3, 9])
-    law = SaintVenantKirchhoff(0.499)
-    problem = Problem.build(mesh, law, fixed=Plane(2, "min"), degree=degree)
-    return problem, Traction(Plane(2, "max"), [0.0, -30 / 3000, 0.0]).on(problem)
+    mesh = fem.box([15.0, 15.0, 80.0], [3, 3, 9])
+    law = fem.SaintVenantKirchhoff(0.499)
+    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(2, "min"), degree=degree)
+    return problem, fem.Traction(fem.Plane(2, "max"), [0.0, -30 / 3000, 0.0]).on(problem)
 
 
-def load_steps(problem: Problem, force: Tensor) -> Iterator[tuple[list[float], Tensor]]:
+def load_steps(problem: fem.Problem, force: Tensor) -> Iterator[tuple[list[float], Tensor]]:
     """Yield R_k / R_1 and the last displacement of each of five load steps of plain Newton.
 
     A step ends where R_k / R_1 < 1e-5, as in Caribou.
@@ -78,7 +61,7 @@ def load_steps(problem: Problem, force: Tensor) -> Iterator[tuple[list[float], T
     state = None
     for step in range(1, 6):
         part = step / 5 * force
-        solver = Newton(
+        solver = fem.Newton(
             problem, tol=1e-15, mixed_integration=False, linear="superlu", factor_reuse_tol=0.0
         )
         norms = []
@@ -90,7 +73,7 @@ def load_steps(problem: Problem, force: Tensor) -> Iterator[tuple[list[float], T
         yield [norm / norms[1] for norm in norms[2:]], state
 
 
-def end_face(problem: Problem, state: Tensor) -> list[float]:
+def end_face(problem: fem.Problem, state: Tensor) -> list[float]:
     """Return where the centre of the end face comes to lie, from the beam's axis [m]."""
     centre = node_at(problem, 7.5, 7.5, 80.0)
     return (80 * (problem.points + state[0])[centre] - torch.tensor([7.5, 7.5, 0.0])).tolist()
@@ -104,7 +87,7 @@ def test_beam_of_caribou_has_its_residuals_and_its_end():
         assert ratios == pytest.approx(printed, rel=0, abs=1e-10)
     state = steps[-1][1]
     assert end_face(problem, state) == pytest.approx([0, -21.0164, 76.1898], abs=1e-4)
-    answer = solve(Newton(problem), load_of(force))
+    answer = fem.solve(fem.Newton(problem), load_of(force))
     assert end_face(problem, answer.displacement) == pytest.approx([0, -21.0164, 76.1898], abs=1e-3)
 
 
@@ -115,8 +98,8 @@ def test_beam_of_caribou_in_quadratic_elements_bends_twice_as_far():
     printed = [0, -49.22035, 58.16711]
     assert end_face(problem, state) == pytest.approx(printed, abs=1e-5)
     assert problem.relative_residual(state, force[None]).item() == pytest.approx(7.4e-4, rel=0.02)
-    answer = solve(Newton(problem), load_of(force))
-    assert answer.status.item() == Status.CONVERGED
+    answer = fem.solve(fem.Newton(problem), load_of(force))
+    assert answer.status.item() == fem.Status.CONVERGED
     assert end_face(problem, answer.displacement) == pytest.approx(printed, abs=1e-3)
 
 
@@ -134,22 +117,24 @@ COOK_OF_DEAL = {1: [8.638, 12.07, 13.86, 14.49, 14.67, 14.72], 2: [14.30, 14.65,
 SIDES = [2, 4, 8, 16, 32, 64]
 
 
-def cook(law: Material, degree: int, count: int, *, solid: bool = False) -> tuple[Problem, Tensor]:
+def cook(
+    law: fem.Material, degree: int, count: int, *, solid: bool = False
+) -> tuple[fem.Problem, Tensor]:
     """Return Cook's membrane [mm] and its load, in plane strain or one element thick with u_z = 0.
 
     The modulus is 2 mu (1 + nu) with mu = 0.4225 N/mm^2, the shear traction 1/16 N/mm^2.
     """
     sides, cells = [1.0] * (2 + solid), [count + 1] * 2 + [2] * solid
-    mesh = (box if solid else rectangle)(sides, cells)
+    mesh = (fem.box if solid else fem.rectangle)(sides, cells)
     x, y = mesh.p[:2]
     mesh = type(mesh)(np.stack([48 * x, 44 * x + y * (44 - 28 * x), *mesh.p[2:]]), mesh.t)
-    points = Problem.build(mesh, law, degree=degree).points.numpy()
+    points = fem.Problem.build(mesh, law, degree=degree).points.numpy()
     held = np.zeros(points.shape, dtype=bool)
     held[:, 2:] = True
     held[points[:, 0] < 1e-9] = True
-    problem = Problem.build(mesh, law, fixed=held, degree=degree)
+    problem = fem.Problem.build(mesh, law, fixed=held, degree=degree)
     value = [0.0, 1 / 16 / (2 * 0.4225 * 1.3), 0.0][: 2 + solid]
-    return problem, Traction(Plane(0, "max"), value).on(problem)
+    return problem, fem.Traction(fem.Plane(0, "max"), value).on(problem)
 
 
 @pytest.mark.parametrize("solid", [False, True], ids=["plane", "solid"])
@@ -157,8 +142,8 @@ def cook(law: Material, degree: int, count: int, *, solid: bool = False) -> tupl
 def test_membrane_of_cook_rises_as_tabulated(solid, law, degree, count, place, printed, digits):
     """Cook's membrane: plane strain and a slice of the solid agree."""
     problem, force = cook(law, degree, count, solid=solid)
-    answer = solve(Newton(problem), load_of(force))
-    assert answer.status.item() == Status.CONVERGED
+    answer = fem.solve(fem.Newton(problem), load_of(force))
+    assert answer.status.item() == fem.Status.CONVERGED
     found = problem.length * answer.displacement[0, node_at(problem, *place)]
     assert found[1].item() == pytest.approx(printed, abs=digits)
     if place == (48, 60):
@@ -175,7 +160,7 @@ SLOW_COOK = [(1, 4), (1, 5), (2, 3)]
 def test_membrane_of_cook_rises_as_printed_by_deal_ii(degree, level):
     """Cook's membrane: the four digits of deal.II's code gallery, 0.5 % on the finest meshes."""
     problem, force = cook(K4, degree, SIDES[level])
-    answer = solve(Newton(problem), load_of(force))
+    answer = fem.solve(fem.Newton(problem), load_of(force))
     rise = problem.length * answer.displacement[0, node_at(problem, 48, 52), 1].item()
     assert float(f"{rise:.4g}") == COOK_OF_DEAL[degree][level]
     assert level < 3 or rise == pytest.approx(14.74, rel=0.02 if degree == 1 else 5e-3)
@@ -197,13 +182,13 @@ DOLFINX_ITERATIONS = [7, 8, 9, 8, 7, 6, 6, 5, 5]
 @pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
 def test_beam_of_the_dolfinx_tutorial_bends_as_computed(degree, mixed):
     """Beam of the dolfinx tutorial: nine loads, each from the previous solution, no load steps."""
-    mesh = box([20.0, 1.0, 1.0], [21, 6, 6])
-    problem = Problem.build(mesh, NH, fixed=Plane(0, "min"), degree=degree)
-    unit = Traction(Plane(0, "max"), [0.0, 0.0, -1.5 / 1e4]).on(problem)
+    mesh = fem.box([20.0, 1.0, 1.0], [21, 6, 6])
+    problem = fem.Problem.build(mesh, NH, fixed=fem.Plane(0, "min"), degree=degree)
+    unit = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -1.5 / 1e4]).on(problem)
     corner, state = node_at(problem, 20, 1, 1), None
     for n, count in enumerate(DOLFINX_ITERATIONS, 1):
         answer = resumed(problem, n * unit, state, tol=1e-9, mixed_integration=mixed)
-        assert answer.status.item() == Status.CONVERGED
+        assert answer.status.item() == fem.Status.CONVERGED
         # theirs is over the first residual; a factor that is used again may cost one more
         assert answer.iterations.item() <= count + 2
         state = answer.displacement
@@ -231,8 +216,8 @@ TWISTED = {
 )
 def test_column_follows_the_rotation_of_its_end(degree, cells, mixed):
     """Twisted column: 90 degrees in nine steps, each from the previous solution."""
-    mesh = box([1.0, 1.0, 5.0], [n + 1 for n in cells])
-    points = 5 * Problem.build(mesh, NH, degree=degree).points
+    mesh = fem.box([1.0, 1.0, 5.0], [n + 1 for n in cells])
+    points = 5 * fem.Problem.build(mesh, NH, degree=degree).points
     centred = points - torch.tensor([0.5, 0.5, 0.0])
     top, state = points[:, 2] > 5 - 1e-9, None
     held = (top | (points[:, 2] < 1e-9)).numpy()
@@ -243,10 +228,10 @@ def test_column_follows_the_rotation_of_its_end(degree, cells, mixed):
             dtype=torch.float64,
         )
         given = torch.where(top[:, None], centred @ turn.T - centred, 0.0).numpy() / 5
-        problem = Problem.build(mesh, NH, fixed=held, prescribed=given, degree=degree)
+        problem = fem.Problem.build(mesh, NH, fixed=held, prescribed=given, degree=degree)
         none = torch.zeros(problem.shape, dtype=torch.float64)
         answer = resumed(problem, none, state, tol=1e-10, mixed_integration=mixed)
-        assert answer.status.item() == Status.CONVERGED
+        assert answer.status.item() == fem.Status.CONVERGED
         assert answer.iterations.item() <= 6
         state = answer.displacement
     reaction = 1e6 * 25 * problem.internal_force(state)[0]
@@ -267,11 +252,11 @@ BEAMS = {
 }
 
 
-def sag(beam, pull, corner, law: Material, cells: tuple[int, int], q: float) -> float:
+def sag(beam, pull, corner, law: fem.Material, cells: tuple[int, int], q: float) -> float:
     """Return u_z of the corner [m] of the paper's beam in hex27."""
     problem = beam(law, *cells, degree=2)
-    answer = solve(Newton(problem, tol=1e-10), load_of(pull(problem, q)[0]))
-    assert answer.status.item() == Status.CONVERGED
+    answer = fem.solve(fem.Newton(problem, tol=1e-10), load_of(pull(problem, q)[0]))
+    assert answer.status.item() == fem.Status.CONVERGED
     return 100 * corner(problem, answer.displacement)[2].item()
 
 
@@ -298,7 +283,7 @@ def test_beams_of_quadratic_elements_tend_to_the_tabulated_limit(
 def test_finest_beam_has_the_tabulated_eigenvalues(beam):
     """The paper's beam: eigenvalues of K(0) in N/m at 12 000 degrees of freedom, to 1e-6."""
     printed = [0.41357726] * 2 + [4.69213513] + [10.51183774] * 2 + [17.59484223]
-    values = eigenmodes(LinearSolver(beam(NH, 39, 9)), len(printed)).values[: len(printed)]
+    values = fem.eigenmodes(fem.LinearSolver(beam(NH, 39, 9)), len(printed)).values[: len(printed)]
     assert (4500 * 100 * values).tolist() == pytest.approx(printed, rel=1e-6)
 
 
@@ -315,12 +300,12 @@ SLENDER["tet4"] = ("tetra", 1, 2)
 def tip(element: str, alpha: float) -> tuple[float, float]:
     """Return w / L and u / L of the end section of a bar 20 x 1 x 1 of SVK, nu = 0."""
     cell, degree, fine = SLENDER[element]
-    mesh = box([20.0, 1.0, 1.0], [20 * fine + 1, fine + 1, fine + 1], cell)
-    law = SaintVenantKirchhoff(0.0)
-    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
-    force = Traction(Plane(0, "max"), [0.0, 0.0, -alpha / 12 / 400]).on(problem)
-    answer = solve(Newton(problem), load_of(force))
-    assert answer.status.item() == Status.CONVERGED
+    mesh = fem.box([20.0, 1.0, 1.0], [20 * fine + 1, fine + 1, fine + 1], cell)
+    law = fem.SaintVenantKirchhoff(0.0)
+    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=degree)
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -alpha / 12 / 400]).on(problem)
+    answer = fem.solve(fem.Newton(problem), load_of(force))
+    assert answer.status.item() == fem.Status.CONVERGED
     mean = force[:, 2] @ answer.displacement[0] / force[:, 2].sum()  # over the section
     return -mean[2].item(), -mean[0].item()
 

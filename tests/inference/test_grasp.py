@@ -6,18 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem import (
-    Box,
-    DirichletBC,
-    Load,
-    Newton,
-    Plane,
-    Problem,
-    RigidPatch,
-    Sphere,
-    rectangle,
-    solve,
-)
+from dpl import fem
 from dpl.inference import Simulator
 from dpl.inference.grasp_forces import MAX_ITER, MOTION_TOL, predicted_forces
 from dpl.models import FCNN
@@ -25,7 +14,7 @@ from dpl.training import MSE, Surrogate
 
 E = 4500.0
 L = 100.0
-END = Plane(axis=0, at="max")
+END = fem.Plane(axis=0, at="max")
 TRANSLATION = [1.0, 6.0, 3.0]  # longer: a shorter column would buckle under dead forces
 ROTATION = [0.08, 0.03, -0.05]
 ONE = torch.ones(1, dtype=torch.float64)
@@ -35,7 +24,7 @@ def simulator_of(scene, predict=None, **more):
     """Return a simulator whose network is a function of a load; left out: the exact solution."""
     torch.manual_seed(0)
     surrogate = Surrogate(FCNN(scene, width=4), MSE(), scene)
-    surrogate.predict = predict or (lambda load: solve(scene.newton, load).displacement)
+    surrogate.predict = predict or (lambda load: fem.solve(scene.newton, load).displacement)
     return Simulator(surrogate, **more)
 
 
@@ -61,25 +50,29 @@ def end_nodes(scene):
 def with_supports(scene, *supports):
     """Return the solution of the body of a scene with moved supports, (N, D) [m]."""
     old = scene.problem
-    body = Problem.build(
-        old.mesh.scaled(L), old.material, fixed=Plane(axis=0, at="min"), supports=supports, length=L
+    body = fem.Problem.build(
+        old.mesh.scaled(L),
+        old.material,
+        fixed=fem.Plane(axis=0, at="min"),
+        supports=supports,
+        length=L,
     )
     rest = torch.zeros(1, *body.shape, dtype=torch.float64)
-    state = solve(Newton(body, tol=1e-10), Load(rest, ONE))
+    state = fem.solve(fem.Newton(body, tol=1e-10), fem.Load(rest, ONE))
     assert state.converged
     return L * state.displacement[0].numpy()
 
 
 def test_a_translated_patch_is_a_moved_support(scene, sim):
     found = sim.grasp(END, TRANSLATION, tol=1e-9)
-    exact = with_supports(scene, DirichletBC(END, TRANSLATION))
+    exact = with_supports(scene, fem.DirichletBC(END, TRANSLATION))
     assert found.converged
     assert np.abs(found.displacement - exact).max() < 1e-7 * L
 
 
 def test_a_direction_without_a_value_is_free(scene, sim):
     found = sim.grasp(END, [None, 6.0, None], tol=1e-9)
-    exact = with_supports(scene, DirichletBC(END, [None, 6.0, None]))
+    exact = with_supports(scene, fem.DirichletBC(END, [None, 6.0, None]))
     assert np.abs(found.displacement - exact).max() < 1e-7 * L
     assert (found.nodal_force[:, [0, 2]] == 0).all()
     assert abs(found.force[1]) > 0
@@ -89,11 +82,11 @@ def test_a_sliding_patch_is_a_roller_that_moves(scene, sim):
     """The normal motion is met, the reaction in the plane of the patch is zero."""
     for region, axis, motion in (
         (END, 0, [6.0, 1.0, -2.0]),
-        (Box([40, 0, 25], [100, 25, 25]), 2, [3.0, 0.0, 1.5]),
+        (fem.Box([40, 0, 25], [100, 25, 25]), 2, [3.0, 0.0, 1.5]),
     ):
         found = sim.grasp(region, motion, tol=1e-9, sliding=True)
         normal = [g if i == axis else None for i, g in enumerate(motion)]
-        exact = with_supports(scene, DirichletBC(region, normal))
+        exact = with_supports(scene, fem.DirichletBC(region, normal))
         assert found.converged
         assert np.abs(found.displacement - exact).max() < 1e-7 * L
         across = [i for i in range(3) if i != axis]
@@ -117,15 +110,15 @@ def test_a_sliding_patch_that_turns_has_the_normal_displacement_of_the_rotation(
 def test_a_plate_holds_the_largest_flat_part_of_a_patch(scene):
     """A ball around an edge has nodes of two faces; the plate touches the larger one."""
     points = scene.problem.points
-    region = Box([50.0, 0.0, 0.0], [100.0, 25.0, 25.0])
-    above = Box([50.0, 0.0, 12.0], [100.0, 25.0, 25.0])  # top, end and parts of two sides
+    region = fem.Box([50.0, 0.0, 0.0], [100.0, 25.0, 25.0])
+    above = fem.Box([50.0, 0.0, 12.0], [100.0, 25.0, 25.0])  # top, end and parts of two sides
     for part, axis, place in ((END, 0, 1.0), (above, 2, 0.25)):
-        patch = RigidPatch.of(scene.linear, part, [True] * 3, sliding=True)
+        patch = fem.RigidPatch.of(scene.linear, part, [True] * 3, sliding=True)
         assert patch.held.any(dim=0).tolist() == [i == axis for i in range(3)]
         assert (points[patch.nodes, axis] == place).all()
-    whole = RigidPatch.of(scene.linear, region, [True] * 3, sliding=True)
+    whole = fem.RigidPatch.of(scene.linear, region, [True] * 3, sliding=True)
     assert whole.held.any(dim=0).sum() == 1
-    again = RigidPatch.of(scene.linear, whole.nodes.numpy(), [True] * 3, sliding=True)
+    again = fem.RigidPatch.of(scene.linear, whole.nodes.numpy(), [True] * 3, sliding=True)
     assert torch.equal(again.held, whole.held)
 
 
@@ -200,7 +193,7 @@ def test_errors_of_a_linear_network_have_slope_two(scene):
 def test_a_tiny_motion_has_the_linear_answer_and_a_vanishing_one_has_rest(scene, sim, size, tol):
     motion = [[size * x for x in vector] for vector in (TRANSLATION, ROTATION)]
     found = sim.grasp(END, *motion, tol=tol)
-    patch = RigidPatch.of(scene.linear, END, [True] * 3)
+    patch = fem.RigidPatch.of(scene.linear, END, [True] * 3)
     arms = scene.problem.points[patch.nodes] - scene.problem.points[patch.nodes].mean(dim=0)
     translation, rotation = torch.tensor(motion, dtype=torch.float64)
     goal = (translation / L + torch.linalg.cross(rotation[None], arms)).flatten()
@@ -213,7 +206,7 @@ def test_a_tiny_motion_has_the_linear_answer_and_a_vanishing_one_has_rest(scene,
     assert np.allclose(found.nodal_force, force, rtol=0, atol=1e-5 * float(force.abs().max()))
 
 
-@pytest.mark.parametrize("region", [END, Box([40, 0, 20], [100, 25, 25])])
+@pytest.mark.parametrize("region", [END, fem.Box([40, 0, 20], [100, 25, 25])])
 def test_errors_of_force_and_moment_are_seen(scene, region):
     """Of small to large motions, of an accurate and a poor network, with and without a tolerance.
 
@@ -269,7 +262,7 @@ def test_a_network_that_is_not_finite_does_not_reach_the_answer_unseen(scene, so
 
 
 def test_a_motion_whose_forces_are_not_found_is_divided_into_parts(scene):
-    patch = RigidPatch.of(scene.linear, END, [True] * 3)
+    patch = fem.RigidPatch.of(scene.linear, END, [True] * 3)
     path = lambda part: patch.displacement([0, 0.05 * part, 0], [0, 0, 0])  # noqa: E731
     sizes = []
 
@@ -289,7 +282,7 @@ def test_a_motion_that_the_network_misses_is_closed_by_the_linear_displacement(s
     raw = simulator_of(scene, lambda load: torch.zeros_like(load.force), steps=0)
     deaf = simulator_of(scene, lambda load: torch.zeros_like(load.force))
     motion = [-26.0, 4.0, 2.0]  # m; cells are 25 m long
-    patch = RigidPatch.of(scene.linear, END, [True] * 3)
+    patch = fem.RigidPatch.of(scene.linear, END, [True] * 3)
     goal = patch.displacement([x / L for x in motion], ROTATION)
     found = raw.grasp(END, motion, ROTATION)
     moved = torch.from_numpy(found.displacement) / L
@@ -316,14 +309,14 @@ def test_a_budget_ends_the_search_for_forces(scene):
 def test_a_budget_ends_newtons_method_and_the_answer_is_the_best_state(scene, monkeypatch):
     sim = simulator_of(scene, linear_network(scene))
     sim.grasp(END, TRANSLATION, ROTATION)  # prepares the patch
-    now, original = [0.0], Newton.iterate
+    now, original = [0.0], fem.Newton.iterate
 
     def slowly(newton, *more, **options):
         for state in original(newton, *more, **options):
             yield state
             now[0] += 10.0
 
-    monkeypatch.setattr(Newton, "iterate", slowly)
+    monkeypatch.setattr(fem.Newton, "iterate", slowly)
     monkeypatch.setattr("dpl.inference.request.time.perf_counter", lambda: now[0])
     found = sim.grasp(END, TRANSLATION, ROTATION, tol=1e-14, budget_ms=15e3)
     assert found.stopped
@@ -342,7 +335,7 @@ def test_a_warm_start_needs_fewer_predictions(scene):
     cold = sim.grasp(END, TRANSLATION, ROTATION)
     again = sim.grasp(END, TRANSLATION, ROTATION, warm=True)
     assert again.iterations == 1 < cold.iterations
-    other = sim.grasp(Sphere([100, 25, 25], 10.0), [0, 1.0, 0], warm=True)
+    other = sim.grasp(fem.Sphere([100, 25, 25], 10.0), [0, 1.0, 0], warm=True)
     assert other.motion_error < MOTION_TOL * 1.01, "forces of another patch are not used"
 
 
@@ -399,7 +392,7 @@ def test_a_mask_of_nodes_is_a_patch_too(scene, sim):
 
 
 def test_supports_in_the_region_stay_where_they_are(scene, sim):
-    side = Plane(axis=1, at="max")
+    side = fem.Plane(axis=1, at="max")
     found = sim.grasp(side, [0.0, 1.0, 0.0], tol=1e-9)
     fixed = ~scene.problem.free.any(dim=1).numpy()
     assert found.converged
@@ -407,9 +400,9 @@ def test_supports_in_the_region_stay_where_they_are(scene, sim):
 
 
 def test_a_body_in_the_plane_turns_by_an_angle(make_scene):
-    scene = make_scene(mesh=rectangle((100.0, 25.0), (5, 3)))
+    scene = make_scene(mesh=fem.rectangle((100.0, 25.0), (5, 3)))
     sim = simulator_of(scene)
-    end = Plane(axis=0, at="max")
+    end = fem.Plane(axis=0, at="max")
     found = sim.grasp(end, [0.0, 5.0], 0.2, tol=1e-9)
     where = (scene.problem.points[:, 0] == 1).numpy()
     x = L * scene.problem.points.numpy()[where]
@@ -424,9 +417,9 @@ def test_a_body_in_the_plane_turns_by_an_angle(make_scene):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda sim: sim.grasp(Sphere([1e4, 0, 0], 1.0), [0, 0, 0]), "no node"),
-        (lambda sim: sim.grasp(Plane(axis=0, at="min"), [0, 0, 1.0]), "free to move"),
-        (lambda sim: sim.grasp(Box([40, 10, 10], [60, 14, 14]), [0, 0, 1.0]), "boundary"),
+        (lambda sim: sim.grasp(fem.Sphere([1e4, 0, 0], 1.0), [0, 0, 0]), "no node"),
+        (lambda sim: sim.grasp(fem.Plane(axis=0, at="min"), [0, 0, 1.0]), "free to move"),
+        (lambda sim: sim.grasp(fem.Box([40, 10, 10], [60, 14, 14]), [0, 0, 1.0]), "boundary"),
         (lambda sim: sim.grasp(END, [0, 1.0]), "3 lengths"),
         (lambda sim: sim.grasp(END, [0, math.nan, 0]), "finite"),
         (lambda sim: sim.grasp(END, [0, 1e12, 0]), r"at most 1e\+06 L"),
@@ -442,7 +435,7 @@ def test_a_body_in_the_plane_turns_by_an_angle(make_scene):
         (lambda sim: sim.grasp(END, [0, 0, 0], young=-1.0), "young"),
         (lambda sim: sim.grasp(END, [0, 0, 0], budget_ms=0), "budget_ms"),
         (lambda sim: sim.grasp(END, [None, 0, 0], sliding=True), "hold"),
-        (lambda sim: sim.grasp(Sphere([100, 25, 25], 1.0), [0, 0, 0], sliding=True), "sliding"),
+        (lambda sim: sim.grasp(fem.Sphere([100, 25, 25], 1.0), [0, 0, 0], sliding=True), "sliding"),
     ],
 )
 def test_invalid_arguments_are_refused_in_one_line(sim, call, words):

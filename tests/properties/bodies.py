@@ -11,23 +11,10 @@ from hypothesis import strategies as st
 from laws import HOOKEAN
 from torch import Tensor
 
-from dpl.fem import (
-    DirichletBC,
-    LinearElastic,
-    LinearSolver,
-    Load,
-    Material,
-    MooneyRivlinK2,
-    OgdenK2,
-    Problem,
-    RobinBC,
-    YeohK2,
-    box,
-    rectangle,
-)
+from dpl import fem
 from dpl.fem.loads import body_force, traction
 
-CUBOID = {"hexahedron": box, "tetra": box, "quad": rectangle, "triangle": rectangle}
+CUBOID = {"hexahedron": fem.box, "tetra": fem.box, "quad": fem.rectangle, "triangle": fem.rectangle}
 HELD = ("clamp", "clamps", "moved", "bed", "rollers")  # each leaves no rigid motion
 SHAKEN = 0.15  # of the distance to a neighbour: cells of any shape keep their sense
 
@@ -60,7 +47,7 @@ class Body:
 
     cell: str
     degree: int
-    law: Material
+    law: fem.Material
     support: str
     sides: tuple[float, ...]
     counts: tuple[int, ...]
@@ -111,26 +98,26 @@ class Body:
 
         return side
 
-    def build(self, **options) -> Problem:
+    def build(self, **options) -> fem.Problem:
         """Return the problem; `options` of `Problem.build` come on top."""
         supports = []
         if self.support in ("clamp", "clamps", "moved"):
-            supports.append(DirichletBC(self.face(0, "min")))
+            supports.append(fem.DirichletBC(self.face(0, "min")))
         if self.support in ("clamps", "moved"):
             by = np.random.default_rng(self.seed).uniform(-0.1, 0.1, self.dim)
             by = by * min(self.sides) * (self.support == "moved")
             way = (self.size * self.rotation @ by).tolist()
-            supports.append(DirichletBC(self.face(0, "max"), way))
+            supports.append(fem.DirichletBC(self.face(0, "max"), way))
         if self.support == "bed":
-            supports.append(RobinBC(self.face(0, "min"), 0.5 / self.size))
+            supports.append(fem.RobinBC(self.face(0, "min"), 0.5 / self.size))
         if self.support == "rollers":
             for axis in range(self.dim):
                 value = [0.0 if i == axis else None for i in range(self.dim)]
-                supports.append(DirichletBC(self.face(axis, "min"), value))
+                supports.append(fem.DirichletBC(self.face(axis, "min"), value))
         options = {"mean_dilatation": self.mean_dilatation, "degree": self.degree} | options
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # linear elements may lock: not the subject here
-            return Problem.build(self.mesh, self.law, supports=supports, **options)
+            return fem.Problem.build(self.mesh, self.law, supports=supports, **options)
 
 
 @dataclass(frozen=True)
@@ -148,7 +135,7 @@ class Push:
     size: float
     seed: int
 
-    def on(self, body: Body, linear: LinearSolver) -> Load:
+    def on(self, body: Body, linear: fem.LinearSolver) -> fem.Load:
         """Return the load on a body."""
         problem, random = linear.problem, np.random.default_rng(self.seed)
         way = random.standard_normal(body.dim)
@@ -174,9 +161,9 @@ class Push:
         return load_of(force[None])
 
 
-def load_of(force: Tensor) -> Load:
+def load_of(force: Tensor) -> fem.Load:
     """Return forces (B, N, D) as a load."""
-    return Load(force, torch.ones(len(force), dtype=torch.float64))
+    return fem.Load(force, torch.ones(len(force), dtype=torch.float64))
 
 
 def rotation(dim: int, seed: int) -> Tensor:
@@ -190,36 +177,36 @@ def rotation(dim: int, seed: int) -> Tensor:
 
 
 @st.composite
-def laws(draw, finite: bool = False) -> Material:
+def laws(draw, finite: bool = False) -> fem.Material:
     """Draw any law with constants for which it resists shear and pressure at rest.
 
     Args:
         draw: Hypothesis'.
         finite: Not the one law of small strains.
     """
-    kinds = [kind for kind in HOOKEAN if not (finite and kind is LinearElastic)]
-    kind = draw(st.sampled_from([*kinds, MooneyRivlinK2, YeohK2, OgdenK2]))
+    kinds = [kind for kind in HOOKEAN if not (finite and kind is fem.LinearElastic)]
+    kind = draw(st.sampled_from([*kinds, fem.MooneyRivlinK2, fem.YeohK2, fem.OgdenK2]))
     if kind in HOOKEAN:
         return kind(draw(st.floats(-0.9, 0.49)))
     bulk = draw(logarithmic(0.1, 100.0))
-    if kind is MooneyRivlinK2:
+    if kind is fem.MooneyRivlinK2:
         c10 = draw(st.floats(0.05, 0.5))
-        return MooneyRivlinK2(c10, draw(st.floats(-c10 / 2, 0.5)), bulk)
-    if kind is YeohK2:
+        return fem.MooneyRivlinK2(c10, draw(st.floats(-c10 / 2, 0.5)), bulk)
+    if kind is fem.YeohK2:
         c10, c20 = draw(st.floats(0.05, 0.5)), draw(st.floats(-0.05, 0.1))
-        return YeohK2(c10, c20, draw(st.floats(0.0, 0.05)), bulk)
+        return fem.YeohK2(c10, c20, draw(st.floats(0.0, 0.05)), bulk)
     exponents = st.floats(0.5, 5.0) | st.floats(-5.0, -0.5)
     first = draw(st.floats(0.1, 0.5)), draw(exponents)
     others = draw(st.lists(st.tuples(st.floats(-0.04, 0.3), exponents), max_size=2))
     shear, powers = zip(first, *others, strict=True)
-    return OgdenK2(shear, powers, bulk)
+    return fem.OgdenK2(shear, powers, bulk)
 
 
 @st.composite
 def bodies(
     draw,
     supports: tuple[str, ...] = HELD,
-    law: st.SearchStrategy[Material] | None = None,
+    law: st.SearchStrategy[fem.Material] | None = None,
     inner: bool = False,
 ) -> Body:
     """Draw a body of less than 130 nodes.
@@ -231,7 +218,7 @@ def bodies(
         inner: Whether it must have vertices inside.
     """
     cell, degree = draw(st.sampled_from(sorted(CUBOID))), draw(st.integers(1, 2))
-    dim = 3 if CUBOID[cell] is box else 2
+    dim = 3 if CUBOID[cell] is fem.box else 2
     support = draw(st.sampled_from(supports))
     most = {(2, 1): 8, (2, 2): 5, (3, 1): 4, (3, 2): 3}[dim, degree]
     least = [
@@ -280,13 +267,13 @@ def cases(draw, *, low: float = 1e-9, high: float = 10.0, **options) -> tuple[Bo
     return body, draw(pushes(body, low, high))
 
 
-def gradients(problem: Problem, displacement: Tensor) -> Tensor:
+def gradients(problem: fem.Problem, displacement: Tensor) -> Tensor:
     """Return H of displacements (B, N, D), (B, E, Q, D, D), by the plainest sum."""
     dN = problem.dN.expand(len(problem.cells), -1, -1, -1)
     return torch.einsum("beai,eqaj->beqij", displacement[:, problem.cells], dN)
 
 
-def bent(problem: Problem, steepness: float, seed: int, batch: int = 1) -> Tensor:
+def bent(problem: fem.Problem, steepness: float, seed: int, batch: int = 1) -> Tensor:
     """Return displacements (B, N, D) of waves and some noise, the largest |H| `steepness`.
 
     Below 1 they invert nothing: no singular value of F is below 1 - |H|.

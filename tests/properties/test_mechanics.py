@@ -25,20 +25,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from tried import at_most, counted
 
-from dpl.fem import (
-    LinearElastic,
-    LinearSolver,
-    Load,
-    Newton,
-    Problem,
-    Solution,
-    Status,
-    eigenmodes,
-    evaluate_solution,
-    installed_backends,
-    solve,
-    symmetries,
-)
+from dpl import fem
 from dpl.fem.linear import full_matrix
 from dpl.fem.loads import body_force, traction
 from dpl.fem.solvers import concatenate
@@ -52,7 +39,7 @@ UNMOVED = tuple(set(HELD) - {"moved"})
 steepnesses = logarithmic(1e-9, 0.6)  # largest |H|: nothing is inverted below 1
 
 
-def slack(problem: Problem, *displacements: Tensor) -> Tensor:
+def slack(problem: fem.Problem, *displacements: Tensor) -> Tensor:
     """Return by how much rounding may change a nodal force at any of some displacements, (B,).
 
     `Problem.roundoff_bound` is a sum of magnitudes with the moduli at rest; a thousand times that
@@ -61,13 +48,13 @@ def slack(problem: Problem, *displacements: Tensor) -> Tensor:
     return 1000 * torch.stack([problem.roundoff_bound(u) for u in displacements]).amax(dim=0)
 
 
-def stiffness(problem: Problem, displacement: Tensor) -> np.ndarray:
+def stiffness(problem: fem.Problem, displacement: Tensor) -> np.ndarray:
     """Return the tangent at (1, N, D) on the free degrees of freedom, (n, n)."""
     values = problem.linearise(displacement).tangent[0].numpy()
     return full_matrix(problem.pattern, values).toarray()
 
 
-def check_same(problem: Problem, load: Load, found: Tensor, expected: Tensor) -> None:
+def check_same(problem: fem.Problem, load: fem.Load, found: Tensor, expected: Tensor) -> None:
     """Check that two answers (1, N, D) are one, to within what their residuals allow.
 
     To first order K (u - v) = R(u) - R(v), so ||u - v|| is at most the residuals' sum over the
@@ -126,7 +113,7 @@ def test_forces_inside_a_body_have_neither_sum_nor_moment(body, steepness, seed)
     allowed = slack(problem, u) * math.sqrt(len(force))
     assert force.sum(dim=0).norm() <= allowed
     points = problem.points - problem.points.mean(dim=0)
-    points = points if isinstance(body.law, LinearElastic) else points + u[0]
+    points = points if isinstance(body.law, fem.LinearElastic) else points + u[0]
     assert turning(points, force).norm() <= allowed * points.norm(dim=1).max()
 
 
@@ -158,7 +145,7 @@ def test_tangent_is_symmetric_and_the_slope_of_the_force(body, steepness, seed, 
     assert torch.where(problem.free, slope - Kv, 0.0).norm() <= 1e-8 * scale
 
 
-class Uncompiled(Problem):
+class Uncompiled(fem.Problem):
     """A problem without compiled loops."""
 
     _compiled = None
@@ -255,7 +242,7 @@ def test_spread_loads_have_their_sum_and_their_moment(body, value):
 def test_linear_answers_are_reciprocal(case, other, data):
     """Maxwell, Betti: the work of a load on the answer to another is that of the other on its."""
     body, push = case
-    linear = LinearSolver(body.build())
+    linear = fem.LinearSolver(body.build())
     f, g = push.on(body, linear).force[0], data.draw(pushes(body)).on(body, linear).force[0]
     u, v = linear.solve(f), linear.solve(g)
     rest = torch.zeros(1, *linear.problem.shape, dtype=torch.float64)
@@ -267,10 +254,10 @@ def test_linear_answers_are_reciprocal(case, other, data):
 @counted
 def test_small_loads_have_an_answer_that_follows_the_linear_one(case):
     body, push = case
-    newton = Newton(body.build())
+    newton = fem.Newton(body.build())
     problem, load = newton.problem, push.on(body, newton.linear_solver)
-    answer = solve(newton, load)
-    assert answer.status.item() == Status.CONVERGED
+    answer = fem.solve(newton, load)
+    assert answer.status.item() == fem.Status.CONVERGED
     u, linear = answer.displacement, newton.linear_solver.solve(load.force[0])
     steep = gradients(problem, u).norm(dim=(-2, -1)).max()
     second = 100 * steep * problem.roundoff_bound(u) / EPS  # of force in |H|
@@ -283,10 +270,10 @@ def test_small_loads_have_an_answer_that_follows_the_linear_one(case):
 @given(body=bodies(UNMOVED), count=st.integers(1, 5))
 @counted
 def test_modes_are_the_lowest_eigenvectors(body, count):
-    linear = LinearSolver(body.build())
+    linear = fem.LinearSolver(body.build())
     problem = linear.problem
     assume(count <= problem.pattern.size // 3)
-    values, vectors = eigenmodes(linear, count)
+    values, vectors = fem.eigenmodes(linear, count)
     assert len(values) >= count
     K = stiffness(problem, torch.zeros(1, *problem.shape, dtype=torch.float64))
     exact = np.linalg.eigvalsh(K)
@@ -299,14 +286,14 @@ def test_modes_are_the_lowest_eigenvectors(body, count):
 # ---------------------------------------------------------------- Newton
 
 
-def check_states(newton: Newton, load: Load, states: list[Solution]) -> None:
+def check_states(newton: fem.Newton, load: fem.Load, states: list[fem.Solution]) -> None:
     """Check what Newton promises of the states that it yields for one load."""
     problem, last = newton.problem, states[-1]
     counts = [state.iterations.item() for state in states]
     assert counts == sorted(counts)
     assert counts[-1] <= newton.max_total_iter
     for state in states:
-        again = evaluate_solution(problem, state.displacement, load, newton.tol)
+        again = fem.evaluate_solution(problem, state.displacement, load, newton.tol)
         assert torch.equal(again.residual, state.residual)
         assert torch.equal(again.volume_ratio, state.volume_ratio)
         assert state.displacement.isfinite().all()
@@ -324,10 +311,10 @@ def check_states(newton: Newton, load: Load, states: list[Solution]) -> None:
         assert apart.abs().max() <= newton.max_total_iter * EPS * problem.prescribed.abs().max()
         return
     factor, u = last.load_factor, last.displacement
-    if last.status == Status.NOT_CONVERGED:
+    if last.status == fem.Status.NOT_CONVERGED:
         assert counts[-1] == newton.max_total_iter
     else:
-        assert last.status == Status.NO_VALID_EQUILIBRIUM
+        assert last.status == fem.Status.NO_VALID_EQUILIBRIUM
     assert (torch.where(problem.free, 0.0, u) - factor * problem.prescribed).abs().max() <= 1e-12
     if factor:
         internal = problem.evaluate(u).internal
@@ -343,7 +330,7 @@ def check_states(newton: Newton, load: Load, states: list[Solution]) -> None:
 @counted
 def test_states_of_newton_are_not_inverted_and_say_what_they_are(case, mixed, budget):
     body, push = case
-    newton = Newton(body.build(), mixed_integration=mixed, max_total_iter=budget)
+    newton = fem.Newton(body.build(), mixed_integration=mixed, max_total_iter=budget)
     load = push.on(body, newton.linear_solver)
     check_states(newton, load, list(newton.iterate(load)))
 
@@ -352,7 +339,7 @@ def test_states_of_newton_are_not_inverted_and_say_what_they_are(case, mixed, bu
 @counted
 def test_newton_says_the_same_of_states_from_any_guess(case, steepness, seed):
     body, push = case
-    newton = Newton(body.build(), max_total_iter=40)
+    newton = fem.Newton(body.build(), max_total_iter=40)
     problem, load = newton.problem, push.on(body, newton.linear_solver)
     guess = bent(problem, steepness, seed)
     states = list(newton.iterate(load, guess=guess))
@@ -361,7 +348,7 @@ def test_newton_says_the_same_of_states_from_any_guess(case, steepness, seed):
     usable = bool(problem.evaluate(held).volume_ratio > 0)
     assert states[0].from_guess.item() == usable
     if not usable:
-        assert torch.equal(states[-1].displacement, solve(newton, load).displacement)
+        assert torch.equal(states[-1].displacement, fem.solve(newton, load).displacement)
 
 
 @given(case=cases(low=1e-3, high=3.0))
@@ -369,9 +356,9 @@ def test_newton_says_the_same_of_states_from_any_guess(case, steepness, seed):
 def test_answer_is_in_balance_as_a_whole(case):
     """Reactions, springs and loads have neither sum nor moment in the deformed body."""
     body, push = case
-    newton = Newton(body.build(), max_total_iter=60)
+    newton = fem.Newton(body.build(), max_total_iter=60)
     problem, load = newton.problem, push.on(body, newton.linear_solver)
-    answer = solve(newton, load)
+    answer = fem.solve(newton, load)
     assume(answer.converged.all())
     u, f = answer.displacement, load.force
     internal = problem.evaluate(u).internal
@@ -385,7 +372,7 @@ def test_answer_is_in_balance_as_a_whole(case):
     )
     assert total.sum(dim=0).norm() <= allowed
     points = problem.points - problem.points.mean(dim=0)
-    points = points if isinstance(body.law, LinearElastic) else points + u[0]
+    points = points if isinstance(body.law, fem.LinearElastic) else points + u[0]
     assert turning(points, total).norm() <= 2 * allowed * points.norm(dim=1).max()
 
 
@@ -399,9 +386,9 @@ def test_answer_that_counts_as_stable_is_a_minimum(case):
     may be either.
     """
     body, push = case
-    newton = Newton(body.build(), max_total_iter=60)
+    newton = fem.Newton(body.build(), max_total_iter=60)
     problem, load = newton.problem, push.on(body, newton.linear_solver)
-    answer = solve(newton, load)
+    answer = fem.solve(newton, load)
     assume(answer.converged.all())
     u, count = answer.displacement, answer.negative_pivots.item()
     rest = np.linalg.eigvalsh(stiffness(problem, torch.zeros_like(u)))
@@ -427,14 +414,14 @@ def test_answer_that_counts_as_stable_is_a_minimum(case):
 @counted
 def test_answer_depends_neither_on_the_size_of_the_body_nor_on_its_modulus(case, factor, young):
     body, push = case
-    newton = Newton(body.build(), max_total_iter=60)
+    newton = fem.Newton(body.build(), max_total_iter=60)
     load = push.on(body, newton.linear_solver)
-    larger = Newton(replace(body, size=factor * body.size).build(), max_total_iter=60)
-    answer = solve(newton, load)
-    stiffer = Load(load.force, torch.tensor([young], dtype=torch.float64))
-    assert torch.equal(solve(newton, stiffer).displacement, answer.displacement)
+    larger = fem.Newton(replace(body, size=factor * body.size).build(), max_total_iter=60)
+    answer = fem.solve(newton, load)
+    stiffer = fem.Load(load.force, torch.tensor([young], dtype=torch.float64))
+    assert torch.equal(fem.solve(newton, stiffer).displacement, answer.displacement)
     assume(answer.stable.all())
-    again = solve(larger, load)
+    again = fem.solve(larger, load)
     assert again.stable.all()
     check_same(newton.problem, load, again.displacement, answer.displacement)
 
@@ -447,16 +434,16 @@ def test_answer_turns_with_body_supports_and_load(case, turn, shift):
     assume(body.support != "rollers")
     turned = replace(body, turned=turn, shift=shift)
     first, second = (
-        Newton(body.build(), max_total_iter=60),
-        Newton(turned.build(), max_total_iter=60),
+        fem.Newton(body.build(), max_total_iter=60),
+        fem.Newton(turned.build(), max_total_iter=60),
     )
     load = push.on(body, first.linear_solver)
-    answer = solve(first, load)
+    answer = fem.solve(first, load)
     assume(answer.stable.all())
     unit = first.problem.length / second.problem.length
     Q = torch.from_numpy(turned.rotation @ body.rotation.T)
     there = load_of(load.force @ Q.mT * unit ** (body.dim - 1))
-    again = solve(second, there)
+    again = fem.solve(second, there)
     assert again.stable.all()
     back = again.displacement @ Q / unit
     check_same(first.problem, load, back, answer.displacement)
@@ -467,18 +454,18 @@ def test_answer_turns_with_body_supports_and_load(case, turn, shift):
 @counted
 def test_ways_to_solve_change_the_way_and_not_the_answer(case, data):
     body, push = case
-    newton = Newton(body.build(), max_total_iter=60)
+    newton = fem.Newton(body.build(), max_total_iter=60)
     problem, load = newton.problem, push.on(body, newton.linear_solver)
-    answer = solve(newton, load)
+    answer = fem.solve(newton, load)
     assume(answer.stable.all())
     for change in (
-        {"linear": data.draw(st.sampled_from(installed_backends()))},
+        {"linear": data.draw(st.sampled_from(fem.installed_backends()))},
         {"mixed_integration": False},
         {"factor_reuse_tol": data.draw(st.sampled_from([0.0, 1.0]))},
         {"corotational": True},
         {"min_detF_ratio": 0.9},
     ):
-        again = solve(Newton(problem, **({"max_total_iter": 200} | change)), load)
+        again = fem.solve(fem.Newton(problem, **({"max_total_iter": 200} | change)), load)
         assert again.stable.all()
         check_same(problem, load, again.displacement, answer.displacement)
 
@@ -489,13 +476,13 @@ def test_ways_to_solve_change_the_way_and_not_the_answer(case, data):
 def test_batch_is_solved_like_its_members(body, data):
     """To the last bit, with factors of one's own; MKL holds one at a time."""
     backend = data.draw(
-        st.sampled_from([name for name in installed_backends() if name != "pardiso"])
+        st.sampled_from([name for name in fem.installed_backends() if name != "pardiso"])
     )
-    newton = Newton(body.build(), max_total_iter=30, linear=backend)
+    newton = fem.Newton(body.build(), max_total_iter=30, linear=backend)
     drawn = data.draw(st.lists(pushes(body, 1e-3), min_size=2, max_size=4))
     loads = [push.on(body, newton.linear_solver) for push in drawn]
-    batch = solve(newton, load_of(torch.cat([load.force for load in loads])))
-    alone = concatenate([solve(newton, load) for load in loads])
+    batch = fem.solve(newton, load_of(torch.cat([load.force for load in loads])))
+    alone = concatenate([fem.solve(newton, load) for load in loads])
     for name in ("displacement", "status", "residual", "iterations", "load_factor"):
         assert torch.equal(getattr(batch, name), getattr(alone, name))
 
@@ -509,7 +496,7 @@ def test_batch_is_solved_like_its_members(body, data):
 )
 @counted
 def test_loads_with_their_own_parameters_are_solved_like_bodies_of_one(body, kind, ratios, data):
-    some = Newton(
+    some = fem.Newton(
         replace(body, law=kind([-0.5, 0.46])).build(), max_total_iter=40, linear="superlu"
     )
     forces = [
@@ -517,11 +504,13 @@ def test_loads_with_their_own_parameters_are_solved_like_bodies_of_one(body, kin
         for _ in ratios
     ]
     poisson = torch.tensor(ratios, dtype=torch.float64)
-    load = Load(torch.cat(forces), torch.ones(len(ratios), dtype=torch.float64), poisson)
-    batch = solve(some, load)
+    load = fem.Load(torch.cat(forces), torch.ones(len(ratios), dtype=torch.float64), poisson)
+    batch = fem.solve(some, load)
     for k, nu in enumerate(ratios):
         problem = replace(body, law=kind(nu)).build()
-        alone = solve(Newton(problem, max_total_iter=40, linear="superlu"), load_of(forces[k]))
+        alone = fem.solve(
+            fem.Newton(problem, max_total_iter=40, linear="superlu"), load_of(forces[k])
+        )
         for name in ("status", "displacement", "residual"):
             assert torch.equal(getattr(batch, name)[k], getattr(alone, name)[0])
 
@@ -536,8 +525,8 @@ def test_homogeneous_deformation_of_the_surface_is_one_of_the_whole(body, steepn
     held = plain.boundary.numpy()
     problem = body.build(fixed=held, prescribed=exact.numpy())
     load = load_of(torch.zeros(1, *problem.shape, dtype=torch.float64))
-    answer = solve(Newton(problem), load)
-    assert answer.status.item() == Status.CONVERGED
+    answer = fem.solve(fem.Newton(problem), load)
+    assert answer.status.item() == fem.Status.CONVERGED
     check_same(problem, load, answer.displacement, exact[None])
 
 
@@ -546,10 +535,10 @@ def test_homogeneous_deformation_of_the_surface_is_one_of_the_whole(body, steepn
 def test_images_of_an_answer_answer_the_images_of_its_load(case):
     body, push = case
     body = replace(body, grading=(1.0,) * body.dim, shaken=0.0)
-    newton = Newton(body.build(), max_total_iter=60)
+    newton = fem.Newton(body.build(), max_total_iter=60)
     problem, load = newton.problem, push.on(body, newton.linear_solver)
-    answer = solve(newton, load)
-    group = symmetries(problem)
+    answer = fem.solve(newton, load)
+    group = fem.symmetries(problem)
     mirrored = body.support not in ("moved", "rollers") and body.cell in ("quad", "hexahedron")
     assert len(group) > mirrored
     for symmetry in group:
@@ -571,7 +560,7 @@ def test_images_of_an_answer_answer_the_images_of_its_load(case):
 @counted
 def test_force_of_another_kind_or_shape_is_an_error_in_words(case, what):
     body, push = case
-    newton = Newton(body.build())
+    newton = fem.Newton(body.build())
     force = push.on(body, newton.linear_solver).force
     wrong = {
         "float32": force.float(),
@@ -581,10 +570,10 @@ def test_force_of_another_kind_or_shape_is_an_error_in_words(case, what):
         "axes": force[..., :-1],
         "none": force[:0],
     }[what]
-    load = Load(wrong, torch.ones(len(wrong), dtype=torch.float64))
+    load = fem.Load(wrong, torch.ones(len(wrong), dtype=torch.float64))
     for solver in (newton, newton.linear_solver):
         with pytest.raises(ValueError, match="force"):
-            solve(solver, load)
+            fem.solve(solver, load)
 
 
 @at_most(0.5)
@@ -597,11 +586,11 @@ def test_force_of_another_kind_or_shape_is_an_error_in_words(case, what):
 def test_force_that_is_no_number_is_in_balance_with_nothing(case, number, place):
     """On held nodes too, where no displacement feels it."""
     body, push = case
-    newton = Newton(body.build(), max_total_iter=30)
+    newton = fem.Newton(body.build(), max_total_iter=30)
     load = push.on(body, newton.linear_solver)
     load.force.view(-1)[int(place * load.force.numel())] = number
     for solver in (newton, newton.linear_solver):
-        answer = solve(solver, load)
+        answer = fem.solve(solver, load)
         assert not answer.converged.any()
         assert not answer.residual.isfinite().any()
 
