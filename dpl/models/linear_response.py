@@ -28,6 +28,7 @@ from dpl.system.threads import on_threads
 
 Array = NDArray[np.float64]
 MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are float32 [-]
+FEW = 8  # loads that compiled loops solve faster than products of matrices do
 MAX_VALUES = 2**26  # of a batch that are computed at a time by tensor operations
 
 
@@ -40,8 +41,8 @@ class LinearResponse:
     If K(0) depends on parameters of the law, the blocks of one parameter are the preconditioner of
     conjugate gradients (`StiffnessIteration`).
 
-    Compiled loops solve on the CPU, one load after the other. Other devices and traced graphs solve
-    batches by tensor operations.
+    Compiled loops solve few loads on the CPU, and all that need steps, one after the other. Larger
+    batches, other devices and traced graphs are solved by tensor operations.
 
     The blocks depend on the scene only and are computed when they are first used.
     """
@@ -160,7 +161,8 @@ class LinearResponse:
             right: Forces by parity, (B, M m), float64.
             factors: Factors of the terms, and 1, (B, T + 1), float64.
         """
-        if right.device.type != "cpu":
+        many = right.shape[0] > FEW and not self.iteration.varies  # which need no steps
+        if right.device.type != "cpu" or many:
             return self.by_tensors(right, factors)
         rows = list(zip(right.numpy(), factors.numpy(), strict=True))
         found = on_threads(lambda row: self._inverse(row[1])(row[0]), rows)
