@@ -20,7 +20,9 @@ INVALID = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "options"), INVALID, ids=str)
+@pytest.mark.parametrize(
+    ("kind", "options"), INVALID, ids=lambda one: getattr(one, "__name__", None) or ",".join(one)
+)
 def test_numbers_out_of_range_are_refused_by_name(scene, tmp_path, kind, options):
     name = next(iter(options))
     place = (scene,) if kind in (DataSet, DataModule) else ()

@@ -1,9 +1,7 @@
 """Networks of other packages have a capability if they define its methods."""
 
-import pytest
 import torch
 
-from dpl.models import CNN, FCNN, Correctable, PODNet, Unrolled
 from dpl.training import MSE, Surrogate
 
 
@@ -23,13 +21,6 @@ class OwnNet(torch.nn.Module):
 
     def fit_bases(self, field, output):
         self.factor.copy_((field * output).sum() / field.square().sum())
-
-
-@pytest.mark.parametrize(
-    ("kind", "expected"), [(FCNN, False), (CNN, False), (PODNet, True), (Unrolled, True)]
-)
-def test_capabilities_of_a_network_are_those_whose_methods_it_defines(scene, kind, expected):
-    assert isinstance(kind(scene), Correctable) == expected
 
 
 def test_bases_of_a_network_of_another_package_are_fitted_once(scene, batch):
