@@ -9,7 +9,8 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, PODGalerkin
+from benchmarks.pod_galerkin import PODGalerkin
+from dpl.fem import Load
 from dpl.inference.hybrid import Predict
 from dpl.models import Correctable, HasCorrection
 from dpl.scene import Sample, Scene

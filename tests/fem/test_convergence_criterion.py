@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from benchmarks.pod_galerkin import PODGalerkin
 from dpl.data.solving.solve import LoadKey, failed_load, solve_load
 from dpl.fem import (
     AndersonSolver,
@@ -23,7 +24,6 @@ from dpl.fem import (
     NeoHookeanLn,
     Newton,
     Plane,
-    PODGalerkin,
     Problem,
     Solution,
     Status,

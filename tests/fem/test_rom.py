@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from benchmarks.pod_galerkin import PODGalerkin
 from dpl.fem import (
     DirichletBC,
     LinearElastic,
@@ -18,7 +19,6 @@ from dpl.fem import (
     NeoHookeanLn,
     Newton,
     Plane,
-    PODGalerkin,
     Problem,
     RobinBC,
     SaintVenantKirchhoff,

@@ -12,6 +12,7 @@ from laws import LAWS
 from torch import Tensor
 from torch.testing import assert_close
 
+from benchmarks.pod_galerkin import PODGalerkin
 from dpl.fem import (
     DirichletBC,
     Load,
@@ -19,7 +20,6 @@ from dpl.fem import (
     NeoHookeanLn,
     Newton,
     Plane,
-    PODGalerkin,
     Problem,
     RobinBC,
     SubspaceNewton,

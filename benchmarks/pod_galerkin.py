@@ -10,10 +10,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from dpl.fem.problem import Problem
-from dpl.fem.rom.ecsw import Cubature, cubature, refuse_follower_loads
-from dpl.fem.rom.pod import pod
-from dpl.fem.rom.reduced_problem import (
+from benchmarks.reduced_problem import (
     ReducedLoad,
     ReducedProblem,
     ReducedState,
@@ -22,6 +19,9 @@ from dpl.fem.rom.reduced_problem import (
     norm,
     refuse_range,
 )
+from dpl.fem.problem import Problem
+from dpl.fem.rom.ecsw import Cubature, cubature, refuse_follower_loads
+from dpl.fem.rom.pod import pod
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.load_stepping import LoadStepping, longest_valid_step
 from dpl.fem.solvers.solution import Load, Solution, check_steps, evaluate_solution
