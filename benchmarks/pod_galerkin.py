@@ -1,30 +1,25 @@
 """Hyper-reduced POD-Galerkin: Newton in the coordinates of a subspace on few weighted cells."""
 
 import math
-import time
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
-from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from benchmarks.reduced_problem import (
-    ReducedLoad,
-    ReducedProblem,
-    ReducedState,
-    beyond_linear,
-    broyden,
-    norm,
-    refuse_range,
-)
-from dpl.fem.problem import Problem
-from dpl.fem.rom.ecsw import Cubature, cubature, refuse_follower_loads
+from dpl.fem import LinearSolver, Problem
+from dpl.fem.rom import Cubature, cubature
+from dpl.fem.rom.ecsw import ReducedMesh, refuse_follower_loads, whitening
 from dpl.fem.rom.pod import pod
-from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.load_stepping import LoadStepping, longest_valid_step
-from dpl.fem.solvers.solution import Load, Solution, check_steps, evaluate_solution
+
+TOL = 1e-5  # reduced relative residual at which the iterations stop [-]
+MAX_ITER = 30  # for one part of a load
+MAX_TOTAL_ITER = 400
+MIN_LOAD_STEP = 2.0**-10
+MIN_DETF_RATIO = 0.2  # a step must leave this part of min det F [-]
+FACTOR_REUSE_TOL = 0.1  # reduced relative residual below which an inverse tangent is reused [-]
+LIFT_TOL = 1e-6  # relative residual of the linear solution to which the subspace adds [-]
+STATES = 256  # evenly spaced snapshots from which the cells are chosen
 
 
 class Reduced(NamedTuple):
@@ -34,75 +29,93 @@ class Reduced(NamedTuple):
         displacement: Displacement over L, (N, D) [-].
         residual: Reduced relative residual under the whole load [-].
         load_factor: Part of the load for which a reduced equilibrium was found [-].
-        iterations, factorisations: Number of iterations, and of reduced tangents except at rest.
     """
 
     displacement: Tensor
     residual: float
     load_factor: float
-    iterations: int
-    factorisations: int
 
 
-@dataclass(frozen=True, eq=False)
+class _Load(NamedTuple):
+    """A load in reduced coordinates.
+
+    Attributes:
+        force: W^T f, (R,).
+        scale: Norm of the residual at rest.
+        offset: Displacement to which the subspace adds at full load, (N, D).
+        cell_offset: Offset at the cells' nodes, (C A D,).
+        offset_error: Difference of `force` and W^T K(0) offset of the cells, (R,).
+    """
+
+    force: Tensor
+    scale: float
+    offset: Tensor
+    cell_offset: Tensor
+    offset_error: Tensor
+
+
+class _State(NamedTuple):
+    """An evaluated iterate.
+
+    Attributes:
+        y: Coordinates in W, (R,).
+        factor: Part of the offset that is applied [-].
+        cell_displacement: Displacement of the cells, (1, C A, D).
+        internal: Reduced internal force, (R,).
+        volume_ratio: min det F of the cells [-].
+        length: Length of the step that led here, 1 for a full one.
+        gap: Strain gap of the mixed integration points, see `Problem.update_strain_gap`.
+    """
+
+    y: Tensor
+    factor: float
+    cell_displacement: Tensor
+    internal: Tensor
+    volume_ratio: float
+    length: float = 1.0
+    gap: Any = None
+
+
 class PODGalerkin:
     """Galerkin projection of the equilibrium onto a subspace: u = offset + V c, V^T R(u) = 0.
 
-    The offset is the displacement of the supports, or with `lift` the linear solution K(0)^-1 f,
-    so that V only has to contain the nonlinear part.
+    The offset is the linear solution K(0)^-1 f with the motion of supports, so that V only has to
+    contain the nonlinear part.
 
-    With a `cubature`, sums over all cells become sums over a few weighted ones, except for their
-    linear part: V^T f_int(u) = V^T K(0) u + sum_e w_e V_e^T (f_e(u) - K_e(0) u_e). These forces
-    derive from an energy, and are exact for small loads.
+    Sums over all cells are sums over a few weighted ones, except for their linear part:
+    V^T f_int(u) = V^T K(0) u + sum_e w_e V_e^T (f_e(u) - K_e(0) u_e). These forces derive from an
+    energy, and are exact for small loads.
 
-    Newton's method shortens steps and applies load steps as `Newton` does. An inverse tangent is
-    reused with Broyden updates while the residual halves. The reduced relative residual is
-    ||L^-1 V^T R|| / ||L^-1 V^T f|| with L L^T = V^T K(0) V: to first order the relative error in
+    Newton's method shortens steps and applies load steps as `dpl.fem.Newton` does. An inverse
+    tangent is reused with Broyden updates while the residual halves. The reduced relative residual
+    is ||L^-1 V^T R|| / ||L^-1 V^T f|| with L L^T = V^T K(0) V: to first order the relative error in
     the energy norm within the subspace.
-
-    The solution counts as converged if it balances the load on the whole body to `tol`, which a
-    solution in a subspace seldom does.
 
     Source: Farhat, Avery, Chapman, Cortial (2014), Int. J. Numer. Methods Eng. 98 (ECSW).
 
     Attributes:
         problem: The body.
-        vectors: V, orthonormal, zero at fixed degrees of freedom, (N, D, R) [-].
-        cubature: Weighted cells; None: all cells.
-        lift: Linear solver, if V is a basis of the displacement minus the linear solution.
-        tol: Relative residual below which a solution counts as converged [-], see
-            `Problem.relative_residual_of`; at least 1e-15, below 1.
-        reduced_tol: Reduced relative residual at which the iterations stop [-].
-        max_iter, max_total_iter, min_load_step, min_detF_ratio: As of `Newton`.
-        factor_reuse_tol: Reduced relative residual below which an inverse tangent is reused [-].
-
-    Raises:
-        ValueError: V does not fit the body, an attribute is out of range, or, at the first load,
-            the body has rigid body modes.
+        lift: Its linear solver.
+        chosen: The weighted cells.
+        cells: Their mesh, with the basis W = V L^-T in which K(0) is the identity.
     """
 
-    problem: Problem
-    vectors: Tensor
-    cubature: Cubature | None = None
-    lift: LinearSolver | None = None
-    tol: float = 1e-8
-    reduced_tol: float = 1e-5
-    max_iter: int = 30
-    max_total_iter: int = 400
-    min_load_step: float = 2.0**-10
-    min_detF_ratio: float = 0.2
-    factor_reuse_tol: float = 0.1
+    def __init__(
+        self, problem: Problem, vectors: Tensor, chosen: Cubature, lift: LinearSolver
+    ) -> None:
+        """Reduce a body to orthonormal V (N, D, R), zero at fixed DOFs, and to weighted cells."""
+        self.problem, self.lift, self.chosen = problem, lift, chosen
+        white = vectors @ whitening(problem, vectors)
+        self.cells = ReducedMesh(problem, white, chosen.cells, chosen.weights.double())
+        self._stiffness = self.cells.product(self.cells.at_rest(), self.cells.basis)
+        self._identity = torch.eye(vectors.shape[2], dtype=torch.float64)
+        self._stiffness_error = self._identity - self.cells.basis.T @ self._stiffness
+        self._rows = white.flatten(0, 1)
+        self._single = self.cells.basis.float()
 
     @classmethod
     def fit(
-        cls,
-        problem: Problem,
-        snapshots: Tensor,
-        rank: int,
-        *,
-        tolerance: float | None = 1e-3,
-        states: int = 256,
-        lift: LinearSolver | None = None,
+        cls, problem: Problem, snapshots: Tensor, rank: int, *, tolerance: float, lift: LinearSolver
     ) -> Self:
         """Return the solver with basis and cells computed from equilibria.
 
@@ -110,159 +123,184 @@ class PODGalerkin:
             problem, lift: Attributes of the solver.
             snapshots: Displacements in equilibrium, (S, N, D) [-].
             rank: Dimension R of the subspace.
-            tolerance: Relative error of their reduced forces [-], see `cubature`; None: all cells.
-            states: Number of evenly spaced snapshots from which the cells are chosen.
+            tolerance: Relative error of their reduced forces [-], see `cubature`.
 
         Raises:
-            ValueError: `rank` is out of range, see `pod`.
+            ValueError: `rank` is out of range, see `pod`, or the body has ranges, follower loads or
+                rigid body modes.
         """
-        refuse_range(problem)
+        for name, ends in problem.material.parameter_ranges.items():
+            raise ValueError(
+                f"{name} = {list(ends)} must be one number, because reduced stiffness and cells "
+                "depend on it; use Problem.with_parameters"
+            )
         refuse_follower_loads(problem, cls.__name__)
-        basis = pod(beyond_linear(problem, snapshots, lift), rank).vectors
+        snapshots = snapshots.double()
+        linear = torch.zeros_like(snapshots)
+        for row, u in zip(linear, snapshots, strict=True):
+            force = problem.evaluate(u[None]).internal[0] - problem.support_force
+            row += _linear_solution(lift, force)
+        nonlinear = (snapshots - linear)[:, problem.free]
+        basis = pod(nonlinear, rank).vectors
         vectors = torch.zeros(*problem.shape, rank, dtype=torch.float64)
         vectors[problem.free] = basis
-        if tolerance is None:
-            return cls(problem, vectors, None, lift)
-        some = torch.linspace(0, len(snapshots) - 1, min(states, len(snapshots))).round().long()
-        return cls.within(problem, vectors, snapshots[some], tolerance=tolerance, lift=lift)
-
-    @classmethod
-    def within(
-        cls,
-        problem: Problem,
-        vectors: Tensor,
-        states: Tensor,
-        *,
-        tolerance: float,
-        lift: LinearSolver | None = None,
-        **options: Any,
-    ) -> Self:
-        """Return the solver in a given subspace, with cells chosen at some states.
-
-        Args:
-            problem, vectors, lift, options: Attributes of the solver.
-            states: Displacements in equilibrium, (S, N, D) [-]; they are projected onto V.
-            tolerance: See `cubature`.
-        """
-        nonlinear, basis = beyond_linear(problem, states, lift), vectors[problem.free]
-        projected = states.clone()
-        projected[:, problem.free] -= nonlinear - (nonlinear @ basis) @ basis.T
-        cells = cubature(problem, vectors, projected, tolerance)
-        return cls(problem, vectors, cells, lift, **options)
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        refuse_range(self.problem)
-        refuse_follower_loads(self.problem, type(self).__name__)
-        check_steps(self, parts=("reduced_tol", "min_detF_ratio", "min_load_step"))
-        if tuple(self.vectors.shape[:2]) != self.problem.shape:
-            found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")
-            raise ValueError(f"vectors.shape = {found} must be {wanted}")
-
-    def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the solution; iterations and factorisations count reduced tangents.
-
-        Raises:
-            ValueError: Loads have parameters of their own.
-        """
-        if load.parameters.shape[-1]:
-            raise ValueError("load.parameters must be empty; use dpl.fem.Newton")
-        found, seconds = [], []
-        for force in load.force:
-            start = time.perf_counter()
-            found.append(self.reduced(force))
-            seconds.append(time.perf_counter() - start)
-        answer = torch.stack([one.displacement for one in found])
-        yield evaluate_solution(self.problem, answer, load, self.tol)._replace(
-            iterations=torch.tensor([one.iterations for one in found]),
-            factorisations=torch.tensor([one.factorisations for one in found]),
-            seconds=torch.tensor(seconds, dtype=torch.float64),
-        )
+        count = min(STATES, len(snapshots))
+        some = torch.linspace(0, len(snapshots) - 1, count).round().long()
+        projected, part = snapshots[some].clone(), nonlinear[some]
+        projected[:, problem.free] -= part - (part @ basis) @ basis.T
+        return cls(problem, vectors, cubature(problem, vectors, projected, tolerance), lift)
 
     def reduced(self, force: Tensor) -> Reduced:
         """Return the equilibrium in the subspace under a force (N, D) [-].
 
         Where none is found, it is that under the largest part of the load for which one was.
         """
-        model, count = self.reduced_problem, _Count()
-        load = model.reduce(force)
-        state = model.state(load, torch.zeros_like(load.force), 0.0)
-        steps = LoadStepping(self.min_load_step)
-        if not load.has_offset and model.relative_residual(load, state, 1.0) < self.reduced_tol:
-            steps.accept()
-        while steps.factor < 1 and not steps.exhausted and count.iterations < self.max_total_iter:
-            end = self._newton(load, state, steps.target, count)
+        load = self._reduce(force)
+        state = self._state(load, torch.zeros_like(load.force), 0.0)
+        steps, iterations = LoadStepping(MIN_LOAD_STEP), 0
+        while steps.factor < 1 and not steps.exhausted and iterations < MAX_TOTAL_ITER:
+            end, count = self._newton(load, state, steps.target)
+            iterations += count
             if end is None:
                 steps.reject()
             else:
                 state = end
                 steps.accept()
+        u = (self._rows @ state.y).view(self.problem.shape)
         return Reduced(
-            displacement=model.displacement(state.y).add_(load.offset, alpha=steps.factor),
-            residual=model.relative_residual(load, state, 1.0),
+            displacement=u.add_(load.offset, alpha=steps.factor),
+            residual=_residual(load, state, 1.0),
             load_factor=steps.factor,
-            iterations=count.iterations,
-            factorisations=count.factorisations,
         )
 
-    def _newton(
-        self, load: ReducedLoad, state: ReducedState, target: float, count: "_Count"
-    ) -> ReducedState | None:
-        """Return the equilibrium under `target` times a load, None without convergence."""
-        model = self.reduced_problem
-        inverse, ratio, before = None, model.relative_residual(load, state, target), math.inf
-        for _ in range(self.max_iter):
-            jump = target - state.offset_factor if load.has_offset else 0.0
-            if inverse is None or jump or not ratio < min(self.factor_reuse_tol, before / 2):
-                count.factorisations += not state.at_rest
-                inverse, right = model.tangent(load, state, target, jump)
+    def _newton(self, load: _Load, state: _State, target: float) -> tuple[_State | None, int]:
+        """Return the equilibrium under `target` times a load, None without one; iterations."""
+        inverse, ratio, before = None, _residual(load, state, target), math.inf
+        for k in range(MAX_ITER):
+            jump = target - state.factor
+            if inverse is None or jump or not ratio < min(FACTOR_REUSE_TOL, before / 2):
+                inverse, right = self._tangent(load, state, target, jump)
                 if inverse is None:
-                    return None
+                    return None, k
             else:
                 right = target * load.force - state.internal
             step = inverse @ right
             new = self._update(load, state, step, jump, target)
-            count.iterations += 1
             if new is None:
-                return None
-            before, ratio = ratio, model.relative_residual(load, new, target)
-            if new.offset_factor == target or not load.has_offset:
-                short = 1e-2 * self.reduced_tol * target * load.scale
-                if ratio < self.reduced_tol or (not jump and norm(step) < short):
-                    return new
-            if count.iterations >= self.max_total_iter:
-                return None
-            if ratio >= self.factor_reuse_tol:
-                new = model.update_strain_gap(state, new)
+                return None, k + 1
+            before, ratio = ratio, _residual(load, new, target)
+            if new.factor == target:
+                is_short = not jump and _norm(step) < 1e-2 * TOL * target * load.scale
+                if ratio < TOL or is_short:
+                    return new, k + 1
+            if ratio >= FACTOR_REUSE_TOL:
+                new = self._with_strain_gap(state, new)
             elif not jump:
-                inverse = broyden(inverse, new.y - state.y, new.internal - state.internal)
+                inverse = _broyden(inverse, new.y - state.y, new.internal - state.internal)
             state = new
-        return None
+        return None, MAX_ITER
 
     def _update(
-        self, load: ReducedLoad, state: ReducedState, step: Tensor, jump: float, target: float
-    ) -> ReducedState | None:
+        self, load: _Load, state: _State, step: Tensor, jump: float, target: float
+    ) -> _State | None:
         """Return the state after the longest of the steps 1, 1/2, ... that inverts no cell."""
 
-        def state_after(length: float) -> ReducedState:
-            part = target if jump and length == 1 else state.offset_factor + length * jump
-            after = self.reduced_problem.state(load, state.y + length * step, part)
+        def state_after(length: float) -> _State:
+            factor = target if length == 1 else state.factor + length * jump
+            after = self._state(load, state.y + length * step, factor)
             return after._replace(length=length)
 
-        return longest_valid_step(state_after, self.min_detF_ratio * min(state.volume_ratio, 1.0))
+        return longest_valid_step(state_after, MIN_DETF_RATIO * min(state.volume_ratio, 1.0))
 
-    @cached_property
-    def reduced_problem(self) -> ReducedProblem:
-        return ReducedProblem(self.problem, self.vectors, self.cubature, self.lift)
+    def _reduce(self, force: Tensor) -> _Load:
+        """Return a load (N, D) in reduced coordinates."""
+        support = self.problem.support_force
+        reduced = force.flatten() @ self._rows
+        scale = _norm((force - support).flatten() @ self._rows)
+        offset = self.problem.prescribed + _linear_solution(self.lift, force - support)
+        cell_offset = offset[self.cells.nodes].flatten()
+        error = reduced - cell_offset @ self._stiffness
+        return _Load(reduced, scale if scale > 0 else 1.0, offset, cell_offset, error)
 
-    def __getstate__(self) -> dict[str, object]:
-        """Pickle without cached properties."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+    def _state(self, load: _Load, y: Tensor, factor: float) -> _State:
+        """Return the evaluated state at coordinates y (R,) with a part of the offset."""
+        cells = self.cells
+        field = cells.field(cells.basis @ y + factor * load.cell_offset)
+        force, volume = cells.problem.evaluate(field)
+        internal = self._internal(load, force, y, factor)
+        return _State(y, factor, field, internal, float(volume))
+
+    def _internal(self, load: _Load, force: Tensor, y: Tensor, factor: float) -> Tensor:
+        """Return the reduced internal force of the body, (R,), from that of the chosen cells."""
+        return self._project(force) + self._stiffness_error @ y + factor * load.offset_error
+
+    def _project(self, force: Tensor) -> Tensor:
+        """Return W^T f, (R,), of forces on the cells' nodes."""
+        return force.flatten() @ self.cells.basis
+
+    def _tangent(
+        self, load: _Load, state: _State, target: float, jump: float
+    ) -> tuple[Tensor | None, Tensor]:
+        """Return the inverse tangent, None if singular, and the right-hand side of a step.
+
+        Args:
+            load: The load.
+            state: The state.
+            target: Load factor.
+            jump: Part of the offset that the step adds.
+        """
+        cells = self.cells
+        if state.factor == 0 and not state.y.any():  # at rest: K(0) and the linear solution
+            return self._identity, torch.zeros_like(state.y)
+        system = cells.problem.linearise(state.cell_displacement, state.gap)
+        if not system.valid:
+            system = cells.problem.linearise(state.cell_displacement)
+        upper = cells.tangents(system.tangent[0])
+        right = target * load.force - self._internal(load, system.force, state.y, state.factor)
+        pull = self._project(cells.product(upper, load.cell_offset))
+        right -= jump * (pull + load.offset_error)
+        rows = self._single.view(*upper.shape[:2], -1)  # float32 in half the time of float64
+        product = self._single.T @ (upper.float() @ rows).flatten(0, 1)
+        tangent = (product + product.T).double() + self._stiffness_error
+        inverse, failed = torch.linalg.inv_ex(tangent)
+        return (None if failed else inverse), right
+
+    def _with_strain_gap(self, state: _State, new: _State) -> _State:
+        """Return the state after a step with the strain gap of its mixed integration points."""
+        problem = self.cells.problem
+        if not problem.material.has_response:
+            return new
+        u = new.cell_displacement
+        update = (u - state.cell_displacement) / new.length
+        return new._replace(gap=problem.update_strain_gap(state.gap, new.length, update, u))
 
 
-@dataclass
-class _Count:
-    """Cost of one load."""
+def _residual(load: _Load, state: _State, target: float) -> float:
+    """Return the reduced relative residual under `target` times a load."""
+    return _norm(target * load.force - state.internal) / (target * load.scale)
 
-    iterations: int = 0
-    factorisations: int = 0
+
+def _broyden(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
+    """Return the updated inverse, which maps the change of the force to the step that caused it.
+
+    Source: Broyden (1965), Math. Comp. 19, the first method in Sherman's and Morrison's form.
+    """
+    predicted = inverse @ change
+    scale = step @ predicted
+    if not scale.abs() > 1e-8 * step.norm() * predicted.norm():
+        return inverse
+    return inverse + torch.outer((step - predicted) / scale, step @ inverse)
+
+
+def _norm(vector: Tensor) -> float:
+    """Return the Euclidean norm of a vector (R,), without overflow or underflow of squares."""
+    largest = float(vector.abs().amax())
+    if not 0 < largest < math.inf:
+        return largest
+    return largest * float(torch.linalg.vector_norm(vector / largest))
+
+
+def _linear_solution(lift: LinearSolver, force: Tensor) -> Tensor:
+    """Return K(0)^-1 f, (N, D), to `LIFT_TOL`; the subspace corrects the error."""
+    problem = lift.problem
+    return problem.extend(lift.factor.solve(problem.restrict(force), LIFT_TOL))

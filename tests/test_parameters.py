@@ -9,7 +9,6 @@ import pytest
 import torch
 from laws import HOOKEAN
 
-from benchmarks.pod_galerkin import PODGalerkin
 from dpl import DataSetError, Sample, fem
 from dpl.config import build as run
 from dpl.data import DataModule, Store, Stream
@@ -202,11 +201,6 @@ def test_a_scene_of_one_refuses_to_predict_for_another(scene, few):
         ValueError, match=r"Load.parameters has 1 columns; the body has ranges of \[\]"
     ):
         Surrogate(FCNN(scene, width=4), MSE(), scene).predict(few.load)
-
-
-def test_a_reduced_basis_refuses_a_range(wide, few):
-    with pytest.raises(ValueError, match=r"poisson = .* must be one number"):
-        PODGalerkin.fit(wide.problem, few.displacement, 2)
 
 
 def test_gradients_of_exact_answers_are_those_of_the_body_of_each_load(wide, few, make_scene):
