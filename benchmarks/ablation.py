@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from benchmarks import paper_tables
-from dpl import Sample, Scene
-from dpl.fem import Load, Material, ModalLoads, Status, solve
+from benchmarks.samples import first, solved
+from dpl import Sample
+from dpl.fem import Material, ModalLoads
 from dpl.models import Unrolled
 from dpl.models.unrolled.features import SampleCells
 from dpl.system.threads import one_thread
@@ -191,14 +192,6 @@ def other_loads(net: Unrolled, row: Row, test: Sample, count: int) -> Iterator[R
                 yield replace(row, part=OTHER_LOADS, variant=title, **errors(net, samples))
 
 
-def solved(scene: Scene, load: Load) -> Sample:
-    """Return loads with their solutions; loads without a stable solution are left out."""
-    found = solve(scene.solver, load)
-    sound = found.status == int(Status.CONVERGED)
-    columns = load.force, found.displacement, load.young, load.parameters
-    return Sample(*(column[sound] for column in columns))
-
-
 def errors(net: Unrolled, samples: Sample) -> dict[str, Any]:
     """Return the errors of a model, before and after one step in its modes, by name of `Row`."""
     own = (samples.parameters,) if net.extra_inputs else ()
@@ -227,8 +220,3 @@ def _metrics(net: Unrolled, predicted: Tensor, samples: Sample) -> dict[str, flo
     metrics = default_metrics(net.scene.problem)
     metrics.update(predicted, samples)
     return {name: float(value) for name, value in metrics.compute().items()}
-
-
-def first(samples: Sample, count: int) -> Sample:
-    """Return the first samples."""
-    return Sample(*(column[:count] for column in samples))

@@ -1,50 +1,25 @@
-"""Table and figures of `benchmarks.ablation`."""
+"""Figures of `benchmarks.ablation`."""
 
 from collections.abc import Sequence
-from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from rich import box
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from benchmarks.ablation import ABLATION, CURVE, Row
+from benchmarks.study import picture
 from dpl import Sample
 from dpl.models import Unrolled
-from dpl.visualization import COLOURS, DPI, METHOD_COLOURS, STYLE, draw_body
+from dpl.visualization import COLOURS, METHOD_COLOURS, draw_body
 
 COLOUR = METHOD_COLOURS["unrolled"]
-WIDTH = 100  # of the table [characters]
-COLUMNS = ("loads", "e_mean", "e_max", "SNR", "median", "worst", "+ step", "fit s")
-
-
-def show(rows: Sequence[Row]) -> None:
-    """Print all rows as one table; "+ step" is e_mean after one step of Newton's method."""
-    table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
-    table.add_column("", no_wrap=True)
-    for name in COLUMNS:
-        table.add_column(name, justify="right", no_wrap=True)
-    for part, group in groupby(rows, key=lambda row: row.part):
-        table.add_section()
-        table.add_row(f"[bold]{part}[/]")
-        for row in group:
-            measures = row.e_mean, row.e_max, row.SNR_min, row.rel_L2_median, row.rel_L2_worst
-            cells = [f"{value:.2g}" for value in (*measures, row.e_mean_corrected)]
-            table.add_row(row.variant, f"{row.samples}", *cells, f"{row.fit_seconds:.0f}")
-    Console(width=WIDTH).print(table)
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Draw the learning curve over loads and over minutes, and the errors of the ablation."""
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
     learnt = [row for row in rows if row.part == CURVE]
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11, 3.6), layout="constrained")
+    with picture(path, 11, 3.6) as figure:
         over_loads, over_minutes, variants = figure.subplots(1, 3, width_ratios=(1, 1, 1.2))
         _draw_curve(over_loads, [row.samples for row in learnt], learnt)
         over_loads.set_xlabel("loads that are solved")
@@ -57,8 +32,6 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         else:
             over_minutes.remove()
         _draw_variants(variants, [row for row in rows if row.part == ABLATION])
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI)
 
 
 def _draw_curve(ax: Any, x: Sequence[float], rows: Sequence[Row]) -> None:
@@ -100,15 +73,12 @@ def draw_method(net: Unrolled, test: Sample, path: Path) -> None:
         test: Solved loads.
         path: Of the picture.
     """
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
     panels = _panels(net, test)
     shapes = [panel.displacement for panel in panels if panel.displacement is not None]
     problem = net.scene.problem
     kind = {"projection": "3d"} if problem.shape[1] == 3 else {}
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(13, 2.1))
+    with picture(path, 13, 2.1) as figure:
+        figure.set_layout_engine("none")
         figure.subplots_adjust(0.01, 0.0, 0.99, 0.8, wspace=0.12)
         axes = figure.subplots(1, len(panels), subplot_kw=kind)
         for ax, panel in zip(axes, panels, strict=True):
@@ -122,8 +92,6 @@ def draw_method(net: Unrolled, test: Sample, path: Path) -> None:
         for k in range(1, len(panels)):
             place = k / len(panels), 0.35
             figure.text(*place, "\N{RIGHTWARDS ARROW}", fontsize=20, ha="center", color="0.3")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI)
 
 
 class _Panel(NamedTuple):

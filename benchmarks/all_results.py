@@ -8,8 +8,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from benchmarks import loss_table, paper_tables, subcommands
 from benchmarks.paper_tables import Result
+from benchmarks.study import record
 from dpl import config
-from dpl.evaluation.tables import read, show, write, write_machine
+from dpl.evaluation.tables import read
 
 EXPERIMENTS = ("beam_svk", "propeller_nh", "beam_nh_loss", "beam_young", "beam_young_wide")
 OF_CONVERGENCE = "beam_svk"  # experiment whose networks start Newton's method in experiment 4
@@ -78,9 +79,7 @@ def run(cfg: DictConfig, measure: Callable[[DictConfig], None]) -> list[str]:
     left_out += _convergence(cfg, root / OF_CONVERGENCE, folder)
     rows = [row for name in done for row in beside_the_paper(name, _read(folder, name))]
     if rows:
-        show(rows, "loads in range, beside the paper")
-        write(rows, folder / "paper.csv")
-        write_machine(folder / "paper.json")
+        record(rows, folder / "paper", "loads in range, beside the paper")
     return left_out
 
 
@@ -124,9 +123,7 @@ def _losses(runs: Path, folder: Path) -> list[str]:
     if not names:
         return [f"losses: no finished run below {runs}"]
     rows = loss_table.summaries({name: loss_table.numbers(runs / name) for name in names})
-    show(rows, "losses: medians over seeds")
-    write(rows, folder / "losses.csv")
-    write_machine(folder / "losses.json")
+    record(rows, folder / "losses", "losses: medians over seeds")
     return []
 
 

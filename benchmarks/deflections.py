@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.study import picture
 from dpl import Scene
 from dpl.data.solving.solve import LoadKey
 from dpl.data.solving.worker_pool import solve_loads
 from dpl.data.storage.manifest import STREAMS
-from dpl.visualization import DPI, STYLE
 
 BINS = 20
 AT_LINE: dict[str, Any] = {
@@ -67,12 +67,8 @@ def draw(rows: Sequence[Deflection], file: Path) -> None:
         rows: Deflections of one body or several.
         file: Of the picture.
     """
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
     bodies = by_body(rows)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(3.6 * len(bodies), 2.7), layout="constrained")
+    with picture(file, 3.6 * len(bodies), 2.7) as figure:
         axes = figure.subplots(1, len(bodies), squeeze=False)[0]
         for ax, (name, values) in zip(axes, bodies.items(), strict=True):
             top, middle = max(values), median(values)
@@ -85,4 +81,3 @@ def draw(rows: Sequence[Deflection], file: Path) -> None:
             ax.set_ylim(0, 1.15 * ax.get_ylim()[1])
             ax.yaxis.get_major_locator().set_params(integer=True)
         axes[0].set_ylabel("loads")
-        figure.savefig(file, dpi=DPI)

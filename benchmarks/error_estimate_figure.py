@@ -1,42 +1,16 @@
-"""Table and figure of `benchmarks.error_estimates`."""
+"""Figure and conclusion of `benchmarks.error_estimates`."""
 
 from collections.abc import Sequence
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
-from benchmarks.error_estimates import EXACT, LEAST, SAID, Estimate, Row
-from dpl.visualization import COLOURS, DPI, STYLE
+from benchmarks.error_estimates import EXACT, LEAST, SAID, Estimate
+from benchmarks.study import picture
+from dpl.visualization import COLOURS
 
-WIDTH = 100  # of the table [characters]
 BAND = (1 / 3, 3.0)  # ratios that the figure marks [-]
-CAPTION = (
-    "Estimated over true error of all answers: 5, 50 and 95 %; least: of answers that say less "
-    "than 10 %; missed: those below a third; inf: answers with an infinite estimate."
-)
-
-
-def show(rows: Sequence[Row]) -> None:
-    """Print the quantiles of all rows as one table."""
-    table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0), caption=CAPTION, caption_justify="left")
-    table.add_column("", no_wrap=True)
-    for name in ("answers", "error", "5 %", "50 %", "95 %", "least", "missed", "inf"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for (body, loads), group in groupby(rows, key=lambda row: (row.body, row.loads)):
-        table.add_section()
-        table.add_row(f"[bold]{body}, {loads}[/]")
-        for row in group:
-            ratios = [
-                "" if np.isnan(x) else _short(x) for x in (row.p5, row.median, row.p95, row.least)
-            ]
-            counts = [f"{count or ''}" for count in (row.missed, row.unknown)]
-            table.add_row(row.prediction, f"{row.count}", f"{row.error:.0e}", *ratios, *counts)
-    Console(width=WIDTH).print(table)
 
 
 def conclude(found: Sequence[Estimate]) -> None:
@@ -66,12 +40,8 @@ def _short(ratio: float) -> str:
 
 def draw(found: Sequence[Estimate], path: Path) -> None:
     """Draw estimated over true error against the true error, a panel for each body."""
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
     bodies = list(dict.fromkeys(one.body for one in found))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(3.0 * max(len(bodies), 1.4) + 0.6, 3.6), layout="constrained")
+    with picture(path, 3.0 * max(len(bodies), 1.4) + 0.6, 3.6) as figure:
         axes = figure.subplots(1, len(bodies), sharey=True, squeeze=False)[0]
         for ax, body in zip(axes, bodies, strict=True):
             _draw_body(ax, [one for one in found if one.body == body])
@@ -79,8 +49,6 @@ def draw(found: Sequence[Estimate], path: Path) -> None:
         axes[0].set_ylabel("estimated / true error")
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=min(5, 2 * len(bodies)))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI)
 
 
 def _draw_body(ax: Any, found: Sequence[Estimate]) -> None:

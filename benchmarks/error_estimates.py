@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.ablation import solved
+from benchmarks.samples import solved
 from dpl import Sample, Scene
 from dpl.data import DataModule
 from dpl.fem import (
@@ -164,11 +164,6 @@ def solved_data(scene: Scene, sizes: Sizes, folder: Path) -> DataModule:
     )
     data.prepare_data()
     return data
-
-
-def first(samples: Sample, count: int) -> Sample:
-    """Return the first samples."""
-    return Sample(*(column[:count] for column in samples))
 
 
 def softened(scene: Scene, count: int, seed: int = 0) -> dict[str, Sample]:

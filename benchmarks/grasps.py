@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.study import picture
 from dpl import Scene
 from dpl.fem import Load, RigidPatch, Sphere
 from dpl.inference import Gripper
-from dpl.visualization import DPI, STYLE
 
 RADII = 0.05, 0.15  # smallest and largest radius of a patch over L [-]
 LOADS = 32  # training loads whose largest energy is that of the largest grasp
@@ -332,12 +332,8 @@ def draw(rows: Sequence[Amplitude], file: Path) -> None:
         rows: Rows of `against_amplitude`.
         file: Of the picture.
     """
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
     x = np.array([row.amplitude for row in rows])
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.2, 3.0), layout="constrained")
+    with picture(file, 4.2, 3.0) as figure:
         ax = figure.subplots()
         ax.loglog(x, [row.linear for row in rows], "s-", color="0.6", label="linear solution")
         ax.loglog(x, [row.error for row in rows], "o-", color="black", label="network")
@@ -345,4 +341,3 @@ def draw(rows: Sequence[Amplitude], file: Path) -> None:
         ax.set_xlabel("amplitude of the motion [-]")
         ax.set_ylabel("error of the displacement [-]")
         ax.legend()
-        figure.savefig(file, dpi=DPI)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.paper_tables import ON_LINEAR
+from benchmarks.study import picture
 from dpl.evaluation.tables import write
-from dpl.visualization import DPI, STYLE, method_colours
+from dpl.visualization import method_colours
 
 ERROR = "val/rel_L2_median"
 CSV_LOG = Path("csv", "metrics.csv")  # see conf/logger/csv.yaml
@@ -84,13 +85,9 @@ def draw(curves: Mapping[str, Sequence[Validation]], path: Path) -> None:
         curves: Validations by name of the run, two or more each.
         path: Path of the picture.
     """
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
     families = {name: name.partition("_")[0] for name in curves}
     colours = method_colours(families.values())
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(5.6, 3.4), layout="constrained")
+    with picture(path, 5.6, 3.4) as figure:
         ax = figure.subplots()
         for name, line in curves.items():
             epochs, errors = zip(
@@ -104,4 +101,3 @@ def draw(curves: Mapping[str, Sequence[Validation]], path: Path) -> None:
             )  # fmt: skip
         ax.set(xscale="log", yscale="log", xlabel="epochs", ylabel="median relative L2 error")
         ax.grid(visible=True)
-        figure.savefig(path, dpi=DPI)

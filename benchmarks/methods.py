@@ -9,7 +9,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, PODGalerkin, SubspaceNewton
+from benchmarks.pod_galerkin import PODGalerkin
+from dpl.fem import Load, SubspaceNewton
 from dpl.inference.hybrid import Predict
 from dpl.scene import Sample, Scene
 from dpl.training import Surrogate

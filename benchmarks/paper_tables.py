@@ -8,14 +8,16 @@ import torch
 from torch import Tensor
 
 from benchmarks.methods import Method
+from benchmarks.samples import solved
+from benchmarks.study import picture
 from dpl import Sample, Scene
 from dpl.evaluation import latency
-from dpl.evaluation.tables import read, write, write_machine
-from dpl.fem import Load, Newton, Status, solve
+from dpl.evaluation.tables import read
+from dpl.fem import Load, Newton
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2
 from dpl.training.metrics import default_metrics
-from dpl.visualization import DPI, STYLE, method_colours
+from dpl.visualization import method_colours
 
 # Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples. Experiments 3
 # and 3b differ in the range of Young's modulus, on which only networks with E as an input depend.
@@ -100,10 +102,7 @@ def load_sets(scene: Scene, test: Sample, count: int = 50) -> dict[str, Sample]:
     for name, factor in factors.items():
         drawn = scene.loads.sample((0, STREAMS[name]), range(count))
         load = drawn._replace(force=factor[:, None, None] * drawn.force)
-        answer = solve(scene.solver, load)
-        sound = answer.status == int(Status.CONVERGED)
-        sample = Sample(load.force, answer.displacement, load.young, load.parameters)
-        sets[name] = Sample(*(column[sound] for column in sample))
+        sets[name] = solved(scene, load)
     return sets
 
 
@@ -194,13 +193,6 @@ def with_kept_rows(rows: Sequence[Result], path: Path) -> list[Result]:
     return sorted([*rows, *kept], key=lambda row: order.index(row.loads))
 
 
-def save(rows: Sequence[Result], errors: Mapping[tuple[str, str], Tensor], stem: Path) -> None:
-    """Write rows as CSV, the machine as JSON, and a figure of the errors of all loads as PNG."""
-    write(rows, stem.with_suffix(".csv"))
-    write_machine(stem.with_suffix(".json"))
-    draw(errors, stem.with_suffix(".png"))
-
-
 def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
     """Draw the relative error of each load as a dot, a row for each method, and the medians.
 
@@ -208,16 +200,11 @@ def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
         errors: Relative L2 errors (S,) by method and set; each set has a panel.
         path: Path of the picture.
     """
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
     sets = list(dict.fromkeys(title for _, title in errors))
     methods = list(dict.fromkeys(method for method, _ in errors))
     families = {m: m.removesuffix(CORRECTED).removesuffix(ON_LINEAR) for m in methods}
     colours = method_colours(families.values())
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(2.6 * len(sets) + 1.6, 0.3 * len(methods) + 1.0))
-        figure.set_layout_engine("constrained")
+    with picture(path, 2.6 * len(sets) + 1.6, 0.3 * len(methods) + 1.0) as figure:
         axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
         for ax, title in zip(axes, sets, strict=True):
             for row, method in enumerate(methods):
@@ -232,4 +219,3 @@ def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
             ax.grid(visible=True, axis="x")
         axes[0].set_yticks(range(len(methods)), methods)
         axes[0].invert_yaxis()
-        figure.savefig(path, dpi=DPI)

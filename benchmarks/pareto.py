@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from benchmarks.study import picture
 from dpl.evaluation.timing import WARM_UP, percentiles
 from dpl.fem import Load, Solution, Solver, solve
 from dpl.scene import Sample
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, Surrogate
 from dpl.training.metrics import median
-from dpl.visualization import DPI, STYLE, method_colours
+from dpl.visualization import method_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -157,12 +158,10 @@ def draw(
     Errors of Newton on other meshes and the discretisation error of the mesh of the solvers,
     `floor` [-], are relative to the limit under refinement; they have a panel of their own.
     """
-    import matplotlib.pyplot as plt
     from matplotlib.ticker import LogLocator
 
-    with plt.rc_context(STYLE):
-        count = 2 if meshes else 1
-        figure = plt.figure(figsize=(4.0 * count + 1.0, 4.2), layout="constrained")
+    count = 2 if meshes else 1
+    with picture(file, 4.0 * count + 1.0, 4.2) as figure:
         ratios = [1.6, 1.0][:count]
         axes = figure.subplots(1, count, squeeze=False, width_ratios=ratios)[0]
         labels = _draw_methods(axes[0], rows)
@@ -182,8 +181,6 @@ def draw(
         axes[0].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes[0].set_ylabel("relative error, median of the loads")
         _separate(figure, labels)
-        figure.savefig(file, dpi=DPI)
-        plt.close(figure)
 
 
 def _draw_methods(ax: "Axes", rows: Sequence[Point]) -> list["Annotation"]:

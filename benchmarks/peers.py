@@ -12,7 +12,7 @@ import resource
 import statistics
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -349,37 +349,61 @@ def large(linear: str) -> Time:
     return Time(f"100,548 degrees of freedom, {linear}: one iteration", max(times), note=note)
 
 
+@dataclass(frozen=True)
+class Robustness:
+    """Random loads of a body that are solved; iterations and times are of loads in one step.
+
+    Attributes:
+        body: Name of the body.
+        loads: Number of loads.
+        in_one_step: Number of loads that are solved in one load step.
+        with_load_steps: Number of loads that are solved in one load step or more.
+        no_stable_solution: Number of loads for which the solver states a reason, and no solution.
+        iterations: Mean number of iterations.
+        seconds: Median wall time [s].
+        min_det_F: Smallest det F [-].
+        largest_deflection: Largest nodal displacement over L [-].
+    """
+
+    body: str
+    loads: int
+    in_one_step: int
+    with_load_steps: int
+    no_stable_solution: int
+    iterations: float
+    seconds: float
+    min_det_F: float
+    largest_deflection: float
+
+
 def robustness(
     scenes: Mapping[str, Callable[[], Scene]], loads: int, workers: int
-) -> dict[str, dict[str, float]]:
-    """Return the numbers of random loads that are solved in one step and with load steps.
-
-    For the others the solver states a reason, and no solution.
+) -> Iterator[Robustness]:
+    """Yield how many random loads of each scene are solved, in one step and with load steps.
 
     Args:
         scenes: Functions that build the scenes, by name.
         loads: Number of loads of each scene.
         workers: Number of worker processes.
     """
-    results = {}
     for name, build in scenes.items():
         scene = build()
         once = replace(scene, solver=replace(scene.newton, min_load_step=0.9))
         jobs = [LoadKey((0, 0), k) for k in range(loads)]
-        first = {o.job.number: o for o in solve_loads(once, jobs, workers=workers)}
-        failed = [o.job for o in first.values() if not o.accepted]
+        first = list(solve_loads(once, jobs, workers=workers))
+        failed = [o.job for o in first if not o.accepted]
         second = list(solve_loads(scene, failed, workers=workers)) if failed else []
-        done = [o for o in first.values() if o.accepted]
-        results[name] = {
-            "loads": loads,
-            "in one step": len(done),
-            "with load steps": len(done) + sum(o.accepted for o in second),
-            "no stable solution": sum(not o.accepted for o in second),
-            "iterations": statistics.mean(o.iterations for o in done),
-            "seconds": statistics.median(o.seconds for o in done),
-            "min det F": min(o.volume_ratio for o in done),
-            "largest deflection": max(
+        done = [o for o in first if o.accepted]
+        yield Robustness(
+            body=name,
+            loads=loads,
+            in_one_step=len(done),
+            with_load_steps=len(done) + sum(o.accepted for o in second),
+            no_stable_solution=sum(not o.accepted for o in second),
+            iterations=statistics.mean(o.iterations for o in done),
+            seconds=statistics.median(o.seconds for o in done),
+            min_det_F=min(o.volume_ratio for o in done),
+            largest_deflection=max(
                 float(np.linalg.norm(o.displacement, axis=1).max()) for o in done
             ),
-        }
-    return results
+        )

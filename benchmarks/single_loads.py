@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from dpl import Sample, Scene
-from dpl.evaluation.tables import write, write_machine
 from dpl.inference.hybrid import Predict
 from dpl.system.threads import one_thread
 from dpl.training.metrics import MaxError, MeanError, MinSNR, RelativeL2
@@ -102,26 +101,24 @@ def paper(experiment: str) -> list[SingleLoad]:
     ]
 
 
-def save(
+def draw(
     scene: Scene,
     test: Sample,
-    rows: Sequence[SingleLoad],
     displacements: Mapping[str, Tensor],
-    stem: Path,
+    rows: Sequence[SingleLoad],
+    path: Path,
 ) -> None:
-    """Write rows as CSV, the machine as JSON, and the deformed shapes as PNG.
+    """Draw the deformed shapes.
 
     Shapes are coloured by the nodal error on logarithmic scales.
 
     Args:
         scene: The scene.
         test: Test loads with their solutions.
-        rows: Rows of `paper` and `measure`, all measured ones of one load.
         displacements: Displacements of the methods, (1, N, D) [-].
-        stem: Path of the files without extension.
+        rows: Rows of `paper` and `measure`, all measured ones of one load.
+        path: Path of the picture.
     """
-    write(rows, stem.with_suffix(".csv"))
-    write_machine(stem.with_suffix(".json"))
     measured = {row.method: row for row in rows if row.load is not None}
     load = next(row.load for row in rows if row.load is not None)
     shown = [
@@ -131,4 +128,4 @@ def save(
     figure = plot_deformed(
         scene.problem, test.displacement[load : load + 1], shown, upright=True, logarithmic=True
     )
-    figure.savefig(stem.with_suffix(".png"))
+    figure.savefig(path)

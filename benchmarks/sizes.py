@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from benchmarks.discretisation import BEAM, YOUNG
+from benchmarks.study import picture
 from dpl import Sample, Scene
 from dpl.evaluation import latency
 from dpl.fem import LinearSolver, Load, ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, solve
@@ -21,7 +22,7 @@ from dpl.fem.linear import select_backend
 from dpl.models import FCNN, Unrolled
 from dpl.system.threads import one_thread
 from dpl.training import MSE, Surrogate
-from dpl.visualization import DPI, STYLE, method_colours
+from dpl.visualization import method_colours
 
 
 @dataclass(frozen=True)
@@ -140,17 +141,13 @@ PANELS = (  # label, field, drawn lines; each panel has at most four of them
 
 def draw(rows: Sequence[Size], path: Path) -> None:
     """Draw times, parameters and memory against degrees of freedom, with the exponents of fits."""
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
     colours = method_colours([method for _, method in LINES.values()])
     whole = [replace(row, case="process", memory_mb=row.peak_memory_mb) for row in rows]
     families: dict[str, dict[int, Size]] = {}
     for row in [*rows, *whole]:
         start = next(start for start in LINES if row.case.startswith(start))
         families.setdefault(start, {})[row.dofs] = row
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(8.4, 6.2), layout="constrained")
+    with picture(path, 8.4, 6.2) as figure:
         for ax, (label, field, starts) in zip(figure.subplots(2, 2).flat, PANELS, strict=True):
             for start in (start for start in families if start.startswith(starts)):
                 family = families[start].values()
@@ -162,7 +159,6 @@ def draw(rows: Sequence[Size], path: Path) -> None:
             least, most = min(row.dofs for row in rows), max(row.dofs for row in rows)
             ax.set_xlim(least / 1.3, most * (most / least) ** LABEL_SPACE)
             ax.grid(visible=True)
-        figure.savefig(path, dpi=DPI)
 
 
 def _draw_line(ax: Any, known: Sequence[tuple[int, float]], name: str, colour: str) -> None:

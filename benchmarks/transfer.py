@@ -7,13 +7,13 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.study import picture
 from dpl import Sample, Scene
 from dpl.evaluation.tables import share
 from dpl.inference import default_hybrid
 from dpl.inference.hybrid import Predict
 from dpl.system.threads import one_thread
 from dpl.training.metrics import MinSNR, RelativeL2, median
-from dpl.visualization import DPI, STYLE
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,7 @@ def draw(rows: Sequence[Transfer], path: Path) -> None:
         rows: Rows of `measure` for all networks and families.
         path: Path of the picture.
     """
-    import matplotlib as mpl
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
     networks, trained, tested = (
         list(dict.fromkeys(getattr(row, name) for row in rows))
@@ -117,9 +115,8 @@ def draw(rows: Sequence[Transfer], path: Path) -> None:
     known = {(row.network, row.trained_on, row.tested_on): row.rel_L2_median for row in rows}
     finite = [error for error in known.values() if 0 < error < math.inf]
     norm = LogNorm(min(finite), max(finite))
-    with mpl.rc_context(STYLE):
-        size = (len(networks) * (0.62 * len(tested) + 0.3) + 1.6, 0.36 * len(trained) + 1.2)
-        figure = Figure(figsize=size, layout="constrained")
+    size = (len(networks) * (0.62 * len(tested) + 0.3) + 1.6, 0.36 * len(trained) + 1.2)
+    with picture(path, *size) as figure:
         axes = figure.subplots(1, len(networks), sharey=True, squeeze=False)[0]
         for ax, network in zip(axes, networks, strict=True):
             errors = [[known.get((network, a, b), math.nan) for b in tested] for a in trained]
@@ -134,4 +131,3 @@ def draw(rows: Sequence[Transfer], path: Path) -> None:
             ax.tick_params(length=0)
             ax.set_xlabel("tested on")
         axes[0].set_ylabel("trained on")
-        figure.savefig(path, dpi=DPI)

@@ -203,11 +203,6 @@ def test_a_scene_of_one_refuses_to_predict_for_another(scene, few):
         Surrogate(FCNN(scene, width=4), MSE(), scene).predict(few.load)
 
 
-def test_a_reduced_basis_refuses_a_range(wide, few):
-    with pytest.raises(ValueError, match=r"poisson = .* must be one number"):
-        fem.PODGalerkin.fit(wide.problem, few.displacement, 2)
-
-
 def test_gradients_of_exact_answers_are_those_of_the_body_of_each_load(wide, few, make_scene):
     force = few.force.clone().requires_grad_()
     fem.DifferentiableSolve(wide.solver)(

@@ -4,16 +4,21 @@ Fits the model to 64, 128, ... loads, and variants of it to `ablation_loads` loa
 a figure of them and a figure of the method.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from hydra.utils import get_object
 from omegaconf import DictConfig
 
 from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands.cli import command
+
+if TYPE_CHECKING:
+    from benchmarks.ablation import Row
 
 KEYS = (
     (Sequence[int], "counts", 1, 10**7),
@@ -26,7 +31,8 @@ KEYS = (
 def main(cfg: DictConfig) -> None:
     """Fit all variants, print one table and write rows and figures."""
     from benchmarks import ablation, ablation_figures
-    from dpl.evaluation.tables import write, write_machine
+    from benchmarks.samples import first
+    from benchmarks.study import record
     from dpl.models import Unrolled
 
     needed = max(cfg.ablation_loads, *cfg.counts)
@@ -37,7 +43,7 @@ def main(cfg: DictConfig) -> None:
         )
     scene = config.build_scene(cfg)
     build = partial(config.instantiate, cfg, "model", scene=scene)
-    if not isinstance(build(), Unrolled):
+    if get_object(cfg.model._target_) is not Unrolled:
         raise config.ConfigError("model must be unrolled; its parts are left out one by one")
     variants = ablation.variants(cfg.options)
     for variant in variants:  # invalid options are refused before loads are solved
@@ -46,26 +52,23 @@ def main(cfg: DictConfig) -> None:
     samples, held_out, test = (data.samples(split) for split in ("train", "val", "test"))
     seconds = data.store.seconds_per_load()
     folder = Path(cfg.folder)
-    rows: list[ablation.Row] = []
 
-    def record(row: ablation.Row) -> None:
-        solved = None if seconds is None else seconds * (row.samples + len(held_out.force))
-        rows.append(replace(row, data_seconds=solved))
-        write(rows, folder / "unrolled.csv")
-        print(f"{row.part}, {row.variant}, {row.samples} loads: e_mean {row.e_mean:.2g}")
+    def rows() -> "Iterator[Row]":
+        yield from ablation.curve(build, samples, held_out, test, cfg.counts)
+        some = first(samples, cfg.ablation_loads)
+        for variant in variants:
+            row, net = ablation.fitted(variant, build, some, held_out, test, ablation.ABLATION)
+            yield row
+            if variant.is_whole:
+                ablation_figures.draw_method(net, test, folder / "unrolled_method.png")
+                whole = net, row
+        yield from ablation.other_loads(*whole, test, cfg.count)
 
-    for row in ablation.curve(build, samples, held_out, test, cfg.counts):
-        record(row)
-    some = ablation.first(samples, cfg.ablation_loads)
-    for variant in variants:
-        row, net = ablation.fitted(variant, build, some, held_out, test, ablation.ABLATION)
-        record(row)
-        if variant.is_whole:
-            for other in ablation.other_loads(net, row, test, cfg.count):
-                record(other)
-            ablation_figures.draw_method(net, test, folder / "unrolled_method.png")
-    rows.sort(key=lambda row: ablation.PARTS.index(row.part))
-    write(rows, folder / "unrolled.csv")
-    write_machine(folder / "unrolled.json")
-    ablation_figures.draw(rows, folder / "unrolled.png")
-    ablation_figures.show(rows)
+    def timed() -> "Iterator[Row]":
+        for row in rows():
+            solved = None if seconds is None else seconds * (row.samples + len(held_out.force))
+            yield replace(row, data_seconds=solved)
+            print(f"{row.part}, {row.variant}, {row.samples} loads: e_mean {row.e_mean:.2g}")
+
+    title = "unrolled: learning curve, ablation, other loads; 1 thread"
+    record(timed(), folder / "unrolled", title, ablation_figures.draw)

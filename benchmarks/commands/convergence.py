@@ -38,6 +38,7 @@ KEYS = (
 def main(cfg: DictConfig) -> None:
     """Measure all solvers on all loads; write rows, machine and figure."""
     from benchmarks import newton_figure, newton_starts
+    from benchmarks.study import record
 
     runs = config.load_runs(cfg.run, cfg.networks, trust=cfg.trust)
     scene = next(iter(runs.values()))[1].scene
@@ -46,13 +47,13 @@ def main(cfg: DictConfig) -> None:
     limit = cfg.max_plain_iterations
     within = [] if limit is None else newton_starts.limited(trials, limit)
     rows = newton_starts.PAPER + newton_starts.summary([*trials, *within])
-    stem = Path(cfg.folder) / cfg.name
-    tables.show(rows, f"{cfg.name}, one load at a time, 1 thread")
-    tables.write(rows, stem.with_suffix(".csv"))
-    tables.write_machine(stem.with_suffix(".json"))
     near = [trial for trial in trials if not trial.loads.endswith("times")]
-    if near:
-        newton_figure.draw(near, stem.with_suffix(".png"), limit=limit)
+
+    def draw(_: object, path: Path) -> None:
+        newton_figure.draw(near, path, limit=limit)
+
+    title = f"{cfg.name}, one load at a time, 1 thread"
+    record(rows, Path(cfg.folder) / cfg.name, title, draw if near else None)
 
 
 def measure(cfg: DictConfig, scene: "Scene", networks: "Mapping[str, Predict]") -> list["Trial"]:

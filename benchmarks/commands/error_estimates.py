@@ -28,7 +28,8 @@ KEYS = ((Sequence[str], "bodies"), (str, "name"), *COUNTS)
 def main(cfg: DictConfig) -> None:
     """Compare the estimates on all bodies, print one table and write rows and a figure."""
     from benchmarks import error_estimate_figure, error_estimates
-    from dpl.evaluation.tables import write, write_machine
+    from benchmarks.study import record
+    from dpl.evaluation.tables import write
 
     unknown = set(cfg.bodies) - set(error_estimates.BODIES)
     if unknown or not cfg.bodies:
@@ -38,16 +39,15 @@ def main(cfg: DictConfig) -> None:
     found = list(_of_runs(cfg) if cfg.run else _of_bodies(cfg, folder))
     rows = error_estimates.summarised(found)
     write(found, folder / f"{cfg.name}_loads.csv")
-    write(rows, folder / f"{cfg.name}.csv")
-    write_machine(folder / f"{cfg.name}.json")
-    error_estimate_figure.draw(found, folder / f"{cfg.name}.png")
-    error_estimate_figure.show(rows)
+    title = "estimated over true error of all answers, 1 thread"
+    record(rows, folder / cfg.name, title, lambda _, path: error_estimate_figure.draw(found, path))
     error_estimate_figure.conclude(found)
 
 
 def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator["Estimate"]:
     """Yield the estimates of models that are trained on each body."""
     from benchmarks import error_estimates
+    from benchmarks.samples import first
 
     sizes = error_estimates.Sizes(cfg.train, cfg.val, cfg.test, cfg.epochs)
     for body in cfg.bodies:
@@ -56,7 +56,7 @@ def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator["Estimate"]:
         print(*scene.describe()[0], flush=True)
         data = error_estimates.solved_data(scene, sizes, folder / "data" / body)
         simulators = error_estimates.trained(scene, data, sizes.epochs)
-        test = error_estimates.first(data.samples("test"), sizes.test)
+        test = first(data.samples("test"), sizes.test)
         more = error_estimates.softened(scene, cfg.softened)
         yield from error_estimates.estimates(body, scene, test, simulators, more)
         print(f"{body}: {time.perf_counter() - start:.0f} s", flush=True)
@@ -65,12 +65,13 @@ def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator["Estimate"]:
 def _of_runs(cfg: DictConfig) -> Iterator["Estimate"]:
     """Yield the estimates of all runs in a folder."""
     from benchmarks import error_estimates
+    from benchmarks.samples import first
     from dpl.inference import Simulator
 
     runs = config.load_runs(cfg.run)
-    first, surrogate = next(iter(runs.values()))
+    run, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
-    data = config.load_data(first, scene)
+    data = config.load_data(run, scene)
     simulators = {name: Simulator(surrogate) for name, (_, surrogate) in runs.items()}
-    test = error_estimates.first(data.samples("test"), cfg.test)
+    test = first(data.samples("test"), cfg.test)
     yield from error_estimates.estimates(Path(cfg.run).name, scene, test, simulators)

@@ -19,8 +19,9 @@ KEYS = (
 def main(cfg: DictConfig) -> None:
     """Measure random grasps: motion, displacement, reactions, estimated error and times."""
     from benchmarks import grasps
+    from benchmarks.study import record
     from dpl import config
-    from dpl.evaluation.tables import show, write, write_machine
+    from dpl.evaluation.tables import write
     from dpl.inference import Gripper
     from dpl.models.unrolled.correction import MAX_STEPS
     from dpl.system.threads import one_thread
@@ -38,10 +39,8 @@ def main(cfg: DictConfig) -> None:
     with one_thread():
         rows, unknown = grasps.measure(gripper, every, say)
         amplitudes = grasps.against_amplitude(gripper, every[: cfg.amplitudes])
-    show(rows, f"{cfg.count - unknown} random grasps, 1 thread")
+    title = f"{cfg.count - unknown} random grasps, 1 thread"
+    record(rows, stem, title, lambda _, path: grasps.draw(amplitudes, path))
+    write(amplitudes, stem.with_name(f"{cfg.name}_amplitude.csv"))
     print(f"without a solution by Newton's method from rest, left out: {unknown}")
     print(f"slope of the error of the network in the amplitude: {grasps.slope(amplitudes):.2f}")
-    write(rows, stem.with_suffix(".csv"))
-    write(amplitudes, stem.with_name(f"{cfg.name}_amplitude.csv"))
-    write_machine(stem.with_suffix(".json"))
-    grasps.draw(amplitudes, stem.with_suffix(".png"))

@@ -28,6 +28,7 @@ KEYS = (METHODS, (str | None, "discretisation"))
 def main(cfg: DictConfig) -> None:
     """Measure all solvers and the networks of a folder of runs; write rows and a figure."""
     from benchmarks import pareto
+    from benchmarks.study import record
     from dpl.system.threads import available_cores
 
     others = _discretisations(cfg)
@@ -40,15 +41,13 @@ def main(cfg: DictConfig) -> None:
             tick = partial(progress.advance, bar)
             rows += pareto.points(solvers, batch, threads=count, tick=tick)
     title = Path(cfg.run).name
-    _show(title, rows)
-    stem = Path(cfg.folder) / f"pareto_{title}"
-    tables.write(rows, stem.with_suffix(".csv"))
     degree, dofs = scene.problem.degree, scene.problem.free.numel()
     floor = next((m.error for m in others if (m.degree, m.dofs) == (degree, dofs)), None)
     first = [row for row in rows if row.threads == rows[0].threads]
-    pareto.draw(first, others, floor, stem.with_suffix(".png"))
-    tables.write_machine(stem.with_suffix(".json"), threads=rows[0].threads)
-    print(f"written to {stem}.csv and {stem}.png")
+    record(
+        rows, Path(cfg.folder) / f"pareto_{title}", title,
+        lambda _, path: pareto.draw(first, others, floor, path), threads=rows[0].threads,
+    )  # fmt: skip
 
 
 def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
@@ -59,17 +58,6 @@ def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
         return []
     with config.error_in("discretisation", OSError, ValueError):
         return tables.read(Discretisation, Path(cfg.discretisation))
-
-
-def _show(title: str, rows: list["Point"]) -> None:
-    columns = (title, "iteration", "threads", "ms", "p99", "error", "max error", "||R||/||f||")
-    cells = []
-    for row in rows:
-        times = f"{row.ms:.2f}", f"{row.ms_p99:.2f}"
-        errors = f"{row.error:.1e}", f"{row.max_error:.1e}", f"{row.residual:.1e}"
-        name = "" if row.iteration else row.solver
-        cells.append([name, str(row.iteration), str(row.threads), *times, *errors])
-    tables.show_cells("", columns, cells)
 
 
 def _solvers(cfg: DictConfig) -> tuple["dpl.Scene", dict[str, "fem.Solver"], "dpl.Sample"]:

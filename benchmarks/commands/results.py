@@ -6,6 +6,7 @@ the runs.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,7 +48,7 @@ def main(cfg: DictConfig) -> None:
 def measure(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
     from benchmarks import learning_curves, methods, paper_tables
-    from dpl.evaluation.tables import show
+    from benchmarks.study import record
 
     runs = config.load_runs(cfg.run, cfg.networks)
     first, surrogate = next(iter(runs.values()))
@@ -71,8 +72,8 @@ def measure(cfg: DictConfig) -> None:
     stem = Path(cfg.folder) / cfg.name
     if cfg.keep:
         rows = paper_tables.with_kept_rows(rows, stem.with_suffix(".csv"))
-    show(rows, f"{cfg.name}, one load at a time, 1 thread")
-    paper_tables.save(rows, errors, stem)
+    title = f"{cfg.name}, one load at a time, 1 thread"
+    record(rows, stem, title, lambda _, path: paper_tables.draw(errors, path))
     learning_curves.save([Path(cfg.run) / name for name in runs], Path(f"{stem}_curves"))
 
 
@@ -81,11 +82,10 @@ def _single(
 ) -> None:
     """Measure and draw one large test load."""
     from benchmarks import single_loads
-    from dpl.evaluation.tables import show
+    from benchmarks.study import record
 
     load = single_loads.choose(test, cfg.deflection)
     measured, displacements = single_loads.measure(predictions, test, load)
     rows = [*single_loads.paper(cfg.name), *measured]
-    show(rows, f"{cfg.name}, test load {load}")
-    stem = Path(cfg.folder) / f"{cfg.name}_single"
-    single_loads.save(scene, test, rows, displacements, stem)
+    stem, draw = Path(cfg.folder) / f"{cfg.name}_single", partial(single_loads.draw, scene, test)
+    record(rows, stem, f"{cfg.name}, test load {load}", partial(draw, displacements))

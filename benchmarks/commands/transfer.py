@@ -4,7 +4,7 @@ The folder has a folder for each family with the runs of its networks, FAMILY/NE
 have the same body. Test loads are those of the data sets of the runs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +26,7 @@ KEYS = ((Sequence[str] | None, "families"), (str, "name"), (int, "count", 1, 10*
 def main(cfg: DictConfig) -> None:
     """Measure all networks of all families on the test loads of all families."""
     from benchmarks import transfer
-    from dpl.evaluation.tables import show, write, write_machine
+    from benchmarks.study import record
 
     runs = _runs(cfg)
     scenes = {name: next(iter(own.values()))[1].scene for name, own in runs.items()}
@@ -35,16 +35,15 @@ def main(cfg: DictConfig) -> None:
     tests = {name: _test_loads(*next(iter(own.values())), cfg.count) for name, own in runs.items()}
     stem = Path(cfg.folder) / cfg.name
     newton = {name: transfer.newton_iterations(scenes[name], test) for name, test in tests.items()}
-    rows: list[Transfer] = []
-    for family, own in runs.items():
-        for network, (_, surrogate) in own.items():
-            print(f"{family}/{network} ...", flush=True)
-            predict, scene = surrogate.predict, surrogate.scene
-            rows += transfer.measure(network, family, predict, scene, tests, newton)
-            write(rows, stem.with_suffix(".csv"))
-    show(rows, "networks on the loads of other families, 1 thread")
-    write_machine(stem.with_suffix(".json"))
-    transfer.draw(rows, stem.with_suffix(".png"))
+
+    def rows() -> "Iterator[Transfer]":
+        for family, own in runs.items():
+            for network, (_, surrogate) in own.items():
+                print(f"{family}/{network} ...", flush=True)
+                predict, scene = surrogate.predict, surrogate.scene
+                yield from transfer.measure(network, family, predict, scene, tests, newton)
+
+    record(rows(), stem, "networks on the loads of other families, 1 thread", transfer.draw)
 
 
 def _runs(cfg: DictConfig) -> "dict[str, dict[str, tuple[DictConfig, Surrogate]]]":
@@ -60,7 +59,6 @@ def _runs(cfg: DictConfig) -> "dict[str, dict[str, tuple[DictConfig, Surrogate]]
 
 def _test_loads(cfg: DictConfig, surrogate: "Surrogate", count: int) -> "Sample":
     """Return the first test loads of the data set of a run, with their solutions."""
-    from dpl import Sample
+    from benchmarks.samples import first
 
-    test = config.load_data(cfg, surrogate.scene).samples("test")
-    return Sample(*(column[:count] for column in test))
+    return first(config.load_data(cfg, surrogate.scene).samples("test"), count)

@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from dpl.fem.postprocess.surface import surface
     from dpl.fem.problem import Problem
     from dpl.fem.ranges import ParameterRange
-    from dpl.fem.rom.galerkin import PODGalerkin
     from dpl.fem.rom.subspace_newton import SubspaceNewton
     from dpl.fem.solvers.anderson import AndersonSolver
     from dpl.fem.solvers.bifurcation import post_buckling_branches

@@ -5,7 +5,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.rom.pod import pod
+from dpl.fem.rom.pod import orthonormal_fields, pod
 from dpl.models.inputs import Inputs
 from dpl.models.precision import full_precision
 from dpl.models.whitening import partial_whitening, root_mean_square
@@ -133,8 +133,8 @@ class PODNet(nn.Module):
     @property
     def vectors(self) -> Tensor:
         """Orthonormal modes of the displacement, the most important first, (N, D, R), float64."""
-        modes = self.modes.double().cpu()
-        return torch.linalg.qr(modes[modes.any(dim=1)].T)[0].view(*self.scene.problem.shape, -1)
+        modes, free = self.modes.cpu(), self.scene.problem.free.cpu()
+        return orthonormal_fields(modes[modes.any(dim=1)][:, free.flatten()].T, free)
 
     def skipped_work(self) -> list[str]:
         """Return the work that the network saves, one line each."""

@@ -1,21 +1,12 @@
 """Laws of the ablation: variants lack what their names say; errors are those of the model."""
 
-import csv
-
-import matplotlib.image
-import numpy as np
 import pytest
 import torch
 
 from benchmarks import ablation
+from benchmarks.samples import solved
 from dpl.models import Unrolled
 from dpl.training.metrics import default_metrics
-
-TINY = [
-    *("data.train=12", "data.val=4", "data.test=4", "data.workers=0", "model.rank=12"),
-    *("model.cells=4", "model.stages=1", "counts=[8,12]", "ablation_loads=12", "count=2"),
-    *("options.stages=[0]", "options.cells=[2]", "options.rank=[6]"),
-]
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +17,7 @@ def build(scene):
 @pytest.fixture(scope="module")
 def sets(scene):
     """Samples to fit to, and unseen ones."""
-    return [ablation.solved(scene, scene.loads.sample(k, range(n))) for k, n in ((0, 24), (1, 9))]
+    return [solved(scene, scene.loads.sample(k, range(n))) for k, n in ((0, 24), (1, 9))]
 
 
 def fitted(variant, build, sets):
@@ -83,45 +74,3 @@ def test_errors_are_those_of_the_predictions_and_of_a_newton_step(build, sets, m
         known = metrics.compute()
         assert e_mean == pytest.approx(float(known["e_mean"]), rel=1e-6)
         assert worst == pytest.approx(float(known["rel_L2_worst"]), rel=1e-6)
-
-
-def test_the_command_writes_rows_and_figures_and_prints_a_table(script, tiny, tmp_path):
-    ended = script("ablation", *tiny, *TINY, "folder=out", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    table = ended.out[ended.out.rindex("e_max") :].splitlines()
-    assert max(len(line.rstrip()) for line in table) <= 100
-    with (tmp_path / "out/unrolled.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    parts = [row["part"] for row in rows]
-    assert list(dict.fromkeys(parts)) == list(ablation.PARTS)
-    assert {part: parts.count(part) for part in ablation.PARTS} == {
-        ablation.CURVE: 2,
-        ablation.ABLATION: 9,
-        ablation.OTHER_LOADS: 4,
-    }
-    assert all(np.isfinite(float(row["e_mean"])) for row in rows)
-    same = [row for row in rows if row["variant"] == "all" and row["samples"] == "12"]
-    assert len({row["e_mean"] for row in same}) == 1
-    assert float(rows[1]["data_seconds"]) > float(rows[0]["data_seconds"]) > 0
-    assert {line.split()[0] for line in table if line.strip()} >= {"learning", "all", "areas"}
-    for name in ("unrolled.png", "unrolled_method.png"):
-        pixels = matplotlib.image.imread(tmp_path / "out" / name)
-        assert np.ptp(pixels[..., :3]) > 0.5
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("counts=[8,13]", "data.train = 12 must be 13 or more"),
-        ("model=fcnn", "model must be unrolled"),
-        ("+options.stage=[1]", "'stage'"),
-    ],
-)
-def test_invalid_input_is_refused_before_loads_are_solved(
-    script, tiny, tmp_path, override, message
-):
-    settings = [one for one in TINY if not one.startswith("model.") or "fcnn" not in override]
-    ended = script("ablation", *tiny, *settings, override, "folder=out", cwd=tmp_path)
-    assert ended.status == 2
-    assert message in ended.err
-    assert not (tmp_path / "datasets").exists()

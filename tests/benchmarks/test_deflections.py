@@ -50,7 +50,7 @@ def test_rows_and_histograms_are_written(rows, tmp_path):
 
 def test_figures_are_drawn_again_from_the_rows_of_a_folder(rows, tmp_path):
     write(rows, tmp_path / "deflections.csv")
-    mechanics.figures(OmegaConf.create({"folder": str(tmp_path)}), [])
+    mechanics.figures(OmegaConf.create({"folder": str(tmp_path)}))
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["deflections.png"]
 
 

@@ -1,12 +1,9 @@
 """The measurement of devices: every network is measured, and what is timed is what is named."""
 
-import json
-
 import pytest
 import torch
 
 from benchmarks import device_facts, devices
-from dpl.evaluation.tables import read
 
 CPU = torch.device("cpu")
 QUICK = devices.Plan([4], [1, 8], devices.Clock(CPU, 2, 5.0, warm_up=1))
@@ -85,22 +82,6 @@ def test_with_a_gpu_auto_takes_it(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert device_facts.select_device("auto") == torch.device("cuda")
     assert device_facts.select_device("cpu") == CPU
-
-
-def test_the_command_writes_rows_and_machine(script, tiny, tmp_path):
-    sizes = ["repeats=2", "samples=8", "predictions=[1]", "batches=[4]", "folder=out"]
-    ended = script("devices", *tiny, *sizes, "device=cpu", "networks=[fcnn,unrolled]", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    rows = read(devices.DeviceTime, tmp_path / "out/devices_cpu.csv")
-    assert [row.network for row in rows] == ["fcnn"] * 3 + ["unrolled"] * 2
-    facts = json.loads((tmp_path / "out/devices_cpu.json").read_text())
-    assert (facts["device"], facts["torch"]) == ("cpu", torch.__version__)
-
-
-def test_an_unknown_network_ends_with_one_line(script, tiny, tmp_path):
-    ended = script("devices", *tiny, "networks=[rnn]", cwd=tmp_path)
-    assert ended.status == 2
-    assert "error: networks = 'rnn' must be one of fcnn" in ended.err
 
 
 @pytest.mark.gpu

@@ -1,10 +1,8 @@
 """Laws of the calibration: estimates are those of the simulator, quantiles those of the ratios."""
 
-import csv
 import math
 from dataclasses import replace
 
-import matplotlib.image
 import numpy as np
 import pytest
 
@@ -15,8 +13,6 @@ from dpl.fem import solve
 from dpl.inference import Simulator
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
-
-TINY = ["bodies=[beam]", "train=8", "val=2", "test=2", "softened=1", "epochs=1"]
 
 
 @pytest.fixture(scope="module")
@@ -63,40 +59,6 @@ def test_quantiles_are_those_of_finite_ratios_of_each_group():
     assert (second.least, second.missed) == (pytest.approx(0.2), 1)
 
 
-def test_the_command_writes_rows_and_a_figure_and_prints_a_table(script, tmp_path):
-    ended = script("error_estimates", *TINY, "folder=out", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    table = ended.out[ended.out.rindex("answers  error") :].splitlines()
-    assert max(len(line.rstrip()) for line in table) <= 100
-    assert "…" not in ended.out
-    with (tmp_path / "out/error_estimates.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    names = [row["prediction"] for row in rows if row["loads"] == error_estimates.IN_RANGE]
-    assert names == ["fcnn", "pod", "unrolled", "pod + modes"]
-    sets = {"in range", "twice the range", "compressed", "twisted", "pinched"}
-    assert {row["loads"] for row in rows} == sets
-    with (tmp_path / "out/error_estimates_loads.csv").open(newline="") as file:
-        single = list(csv.DictReader(file))
-    assert len(single) == 4 * len(error_estimates.CALLS) * 7
-    pixels = matplotlib.image.imread(tmp_path / "out/error_estimates.png")
-    assert np.ptp(pixels[..., :3]) > 0.5
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("bodies=[beam,table]", "must be some of beam, column, propeller, bracket, plate"),
-        ("bodies=[]", "must be some of"),
-        ("epochs=0", "epochs = 0"),
-    ],
-)
-def test_invalid_input_is_refused_before_loads_are_solved(script, tmp_path, override, message):
-    ended = script("error_estimates", *TINY, override, "folder=out", cwd=tmp_path)
-    assert ended.status == 2
-    assert message in ended.err
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_bodies_are_what_their_names_say():
     scene = error_estimates.bracket()
     points = scene.problem.points
@@ -104,16 +66,3 @@ def test_the_bodies_are_what_their_names_say():
     assert scene.problem.material.poisson == 0.45
     sides = error_estimates.plate().problem.points
     assert (sides.amax(0) - sides.amin(0)).tolist() == pytest.approx([1.0, 0.5, 0.02])
-
-
-def test_trained_runs_are_compared_in_place_of_bodies(script, tiny_training, tmp_path):
-    short = ["model=fcnn", *tiny_training, "trainer.max_epochs=1", "logger=none"]
-    assert script("train", *short, "run=runs/mine/one", cwd=tmp_path).status == 0
-    ended = script("error_estimates", "run=runs/mine", "name=ours", "test=3", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    with (tmp_path / "runs/error_estimates/ours.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert {(row["body"], row["prediction"], row["loads"]) for row in rows} == {
-        ("mine", "one", "in range"),
-        ("mine", "one", "twice the range"),
-    }

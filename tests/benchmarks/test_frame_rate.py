@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from benchmarks import mechanics
-from dpl.config import ConfigError
+from dpl.evaluation.tables import read
 from dpl.inference import Simulator
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
@@ -31,13 +31,9 @@ def test_frames_are_timed_for_each_quantity(scene, monkeypatch, tmp_path):
         "dpl.load", lambda run: Simulator(Surrogate(FCNN(scene, width=4), MSE(), scene).eval())
     )
     cfg = OmegaConf.create({"run": "runs/a", "folder": str(tmp_path)})
-    rows = mechanics.frames(cfg, [])
+    mechanics.frames(cfg)
+    rows = read(frame_rate.FrameTimes, tmp_path / "frames.csv")
     assert [row.quantity for row in rows] == list(QUANTITIES)
     assert all(row.solve_ms > 0 and row.bands_ms > 0 for row in rows)
     assert list(latencies) == ["sim(force)", "bare network"]
     assert all(one.loads == 3 and 0 < one.p50 <= one.p99 for one in latencies.values())
-
-
-def test_a_run_has_to_be_named():
-    with pytest.raises(ConfigError, match=r"run = null must name the trained run"):
-        mechanics.frames(OmegaConf.create({"run": None}), [])

@@ -1,7 +1,5 @@
 """Laws of the benchmark of grasps."""
 
-import csv
-
 import numpy as np
 import pytest
 import torch
@@ -11,8 +9,6 @@ from dpl.fem import RigidPatch
 from dpl.inference import Gripper
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
-
-TINY = ["mesh.nodes=[5,3,3]", "data.train=16", "data.val=4", "data.test=3", "data.workers=0"]
 
 
 @pytest.fixture(scope="module")
@@ -71,17 +67,3 @@ def test_the_error_of_a_linear_network_has_slope_two(gripper, some, tmp_path):
     assert grasps.slope(rows) == pytest.approx(2, abs=0.3)
     grasps.draw(rows, tmp_path / "g.png")
     assert (tmp_path / "g.png").stat().st_size > 1000
-
-
-def test_the_command_writes_rows_and_figure(script, tmp_path):
-    ended = script("train", "model=unrolled", *TINY, "run=runs/one", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    options = ["run=runs/one", "count=3", "amplitudes=2", "folder=out"]
-    ended = script("grasps", *options, cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    assert "slope of the error of the network" in ended.out
-    with (tmp_path / "out/grasps.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["method"] for row in rows][:3] == ["network", "corrected", "hybrid to 1e-6"]
-    assert rows[2]["converged"] == "100"
-    assert (tmp_path / "out/grasps.png").is_file()

@@ -4,9 +4,7 @@ import pytest
 import torch
 
 from benchmarks import local_loads
-from benchmarks.local_loads import LocalLoads
 from dpl import Sample
-from dpl.evaluation.tables import read
 from dpl.fem import solve
 from dpl.models import Unrolled
 from dpl.training import MSE, Surrogate
@@ -44,28 +42,3 @@ def test_the_rows_have_the_errors_of_the_surrogate(surrogate, monkeypatch):
     assert rows[0].error_p50 == pytest.approx(float(errors.quantile(0.5)), rel=1e-4)
     small = [row for row in rows if row.deflection == min(local_loads.DEFLECTIONS)]
     assert all(row.error_p99 < 1e-2 for row in small)
-
-
-def test_the_command_writes_a_row_for_each_kind(script, tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr(local_loads, "missing_packages", lambda: ["onnx"])
-    few = ["data.train=12", "data.val=4", "data.test=2", "data.workers=0"]
-    model = ["model=unrolled", "model.rank=12", "model.cells=8", "model.stages=1"]
-    trained = script("train", *tiny, *few, *model, "run=runs/a", cwd=tmp_path)
-    assert trained.status == 0, trained.err
-    options = "cases=[local]", "run=runs/a", "count=2", "repeats=1"
-    ended = script("benchmark", *options, cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    rows = read(LocalLoads, tmp_path / "runs/benchmark/local_loads_a.csv")
-    assert len(rows) == 5
-    assert "point force, 0.001 L" in ended.out
-    assert [r.count for r in rows if (r.loads, r.deflection) == ("point force", 1e-3)] == [2]
-
-
-def test_a_run_of_unrolled_has_to_be_named(script, tiny_training, tmp_path):
-    ended = script("benchmark", "cases=[local]", cwd=tmp_path)
-    assert ended.status == 2
-    assert "error: run = null must name the trained run" in ended.err
-    trained = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/a", cwd=tmp_path)
-    assert trained.status == 0, trained.err
-    ended = script("benchmark", "cases=[local]", "run=runs/a", cwd=tmp_path)
-    assert "error: run = runs/a must be a run of model=unrolled" in ended.err

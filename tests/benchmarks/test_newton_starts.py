@@ -323,41 +323,25 @@ def test_measurements_older_than_a_network_in_the_file_are_repeated(resumed, net
     assert {trial.network for trial in read(Trial, tmp_path / "e" / "hybrid_newton.csv")} == {""}
 
 
-def test_the_script_measures_the_runs_of_a_folder_and_resumes(script, tiny_training, tmp_path):
-    ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/e/a", cwd=tmp_path)
+def test_the_script_measures_the_runs_of_a_folder_and_resumes(script, trained, tmp_path):
+    few = ["run=runs/tiny", "networks=[fcnn]", "name=whole", f"folder={tmp_path}"]
+    few += ["tols=[1e-3,1e-6,1e-8]", "count=2", "n_far_loads=1"]
+    ended = script("convergence", *few, cwd=trained)
     assert ended.status == 0, ended.err[-2000:]
-    few = ["run=runs/e", "tols=[1e-3,1e-6,1e-8]", "count=2", "n_far_loads=1"]
-    limit = "max_plain_iterations=6"
-    ended = script("convergence", *few, cwd=tmp_path)
-    assert ended.status == 0, ended.err[-2000:]
-    results, raw = tmp_path / "runs" / "convergence", tmp_path / "runs" / "e" / "hybrid_newton.csv"
-    whole = list(csv.DictReader((results / "hybrid_newton.csv").open()))
+    results, raw = tmp_path, trained / "runs/tiny/whole.csv"
+    whole = list(csv.DictReader((results / "whole.csv").open()))
     assert len(whole) == 2 + (3 * 3 + 2) * 8
-    assert (results / "hybrid_newton.png").is_file()
+    assert (results / "whole.png").is_file()
     lines = raw.read_text().splitlines(keepends=True)
     assert len(lines) == 1 + (3 * 2 * 2 + 2) * 8
     raw.write_text("".join(lines[: 1 + 3 * 16 + 5]))  # three sets, and one that was interrupted
-    again = script("convergence", *few, cwd=tmp_path)
+    again = script("convergence", *few, cwd=trained)
     assert again.status == 0, again.err[-2000:]
     kept = raw.read_text().splitlines(keepends=True)
     assert kept[: 1 + 3 * 16] == lines[: 1 + 3 * 16]
     assert len(kept) == len(lines)
-    assert len(list(csv.DictReader((results / "hybrid_newton.csv").open()))) == len(whole)
+    assert len(list(csv.DictReader((results / "whole.csv").open()))) == len(whole)
     raw.write_text("a,b\n")
-    refused = script("convergence", *few, cwd=tmp_path)
+    refused = script("convergence", *few, cwd=trained)
     assert refused.status == 2
     assert "must have the columns" in refused.err
-    raw.unlink()
-    short = ["solvers=[plain Newton]", "tols=[1e-3]", "n_far_loads=0", limit, "name=short"]
-    ended = script("convergence", few[0], few[2], *short, cwd=tmp_path)
-    assert ended.status == 0, ended.err[-2000:]
-    rows = list(csv.DictReader((results / "short.csv").open()))[2:]
-    assert {row["solver"] for row in rows} == {
-        "plain Newton", "robust Newton", "plain Newton, at most 6 iterations",
-    }  # fmt: skip
-    refused = script("convergence", *few, "solvers=[fast]", cwd=tmp_path)
-    assert refused.status == 2
-    assert "solvers: ['fast'] must be names of solvers" in refused.err
-    refused = script("convergence", "run=runs/none", cwd=tmp_path)
-    assert refused.status == 2
-    assert "contains no runs" in refused.err

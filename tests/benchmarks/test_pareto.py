@@ -84,32 +84,6 @@ def test_the_figure_and_the_rows_are_written(rows, tmp_path):
     assert [row["solver"] for row in written] == [row.solver for row in rows]
 
 
-def test_the_script_measures_the_runs_of_a_folder(script, tiny_training, tmp_path):
-    ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/e/a", cwd=tmp_path)
-    assert ended.status == 0, ended.err[-2000:]
-    others = tmp_path / "meshes.csv"
-    write([pareto.Discretisation((4, 1, 1), 1, 135, 3.0, -18.8, 0.34)], others)
-    few = ["run=runs/e", "galerkin.rank=3", f"discretisation={others}"]
-    ended = script("pareto", *few, cwd=tmp_path)
-    assert ended.status == 0, ended.err[-2000:]
-    folder = tmp_path / "runs" / "pareto"
-    assert (folder / "pareto_e.png").is_file()
-    written = list(csv.DictReader((folder / "pareto_e.csv").open()))
-    assert {row["solver"] for row in written} >= {"linear", "POD-Galerkin", "a", "a, hybrid"}
-    refused = script("pareto", "run=runs/none", cwd=tmp_path)
-    assert refused.status == 2
-    assert "contains no runs" in refused.err
-    refused = script("pareto", "run=runs/e", "discretisation=none.csv", cwd=tmp_path)
-    assert refused.status == 2
-    assert refused.err.startswith("error: discretisation: ")
-    assert refused.err.count("\n") == 1
-    refused = script("pareto", "run=runs/e", cwd=tmp_path)
-    assert refused.status == 2
-    assert refused.err.startswith("error: galerkin: rank = 100 must lie between 1 and 16, ")
-    assert refused.err.endswith("; galerkin=null leaves it out\n")
-    assert refused.err.count("\n") == 1
-
-
 def test_a_law_with_a_range_is_measured_without_pod_galerkin(script, tiny_training, tmp_path):
     kept = [one for one in tiny_training if not one.startswith(("model.", "data.train"))]
     law = ["model=unrolled", "material.poisson=[0.2,0.4]", "data.train=40", "run=runs/e/a"]

@@ -4,8 +4,6 @@ import pytest
 import torch
 
 from benchmarks import run_latency
-from benchmarks.run_latency import CallTime, Throughput
-from dpl.evaluation.tables import read
 from dpl.inference import Simulator
 from dpl.models import FCNN
 from dpl.system.threads import available_cores
@@ -82,22 +80,3 @@ def test_batches_are_predicted_whole_on_one_thread_and_on_all_cores(simulator, m
     assert [(rate.threads, rate.batch) for rate in rates] == pairs
     assert all(rate.loads_per_second > 0 for rate in rates)
     assert torch.get_num_threads() == before
-
-
-def test_the_command_prints_and_writes_both_tables(script, tiny_training, tmp_path):
-    trained = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/a", cwd=tmp_path)
-    assert trained.status == 0, trained.err
-    options = "cases=[latency]", "run=runs/a", "samples=2", "repeats=1"
-    ended = script("benchmark", *options, cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    calls = read(CallTime, tmp_path / "runs/benchmark/latency.csv")
-    rates = read(Throughput, tmp_path / "runs/benchmark/throughput.csv")
-    assert all(row.call.strip() in ended.out for row in calls)
-    assert len(rates) == 4 * len({1, available_cores()})
-    assert max(map(len, ended.out.splitlines()[1:])) <= 100
-
-
-def test_a_run_has_to_be_named(script, tmp_path):
-    ended = script("benchmark", "cases=[latency]", cwd=tmp_path)
-    assert ended.status == 2
-    assert "error: run = null must name the trained run" in ended.err

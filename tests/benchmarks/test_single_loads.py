@@ -1,7 +1,5 @@
 """Laws of the comparison on a single load."""
 
-import csv
-
 import pytest
 import torch
 from PIL import Image
@@ -49,32 +47,12 @@ def test_the_paper_s_single_loads_are_named():
     assert single_loads.paper("mine") == []
 
 
-def test_rows_machine_and_a_small_picture_are_written(scene, batch, chosen, tmp_path):
+def test_a_small_picture_is_drawn(scene, batch, chosen, tmp_path):
     exact = batch.displacement[chosen]
     networks = {"near": lambda load: 1.01 * exact[None], "far": lambda load: 1.1 * exact[None]}
     rows, found = single_loads.measure(networks, batch, chosen)
-    single_loads.save(scene, batch, [*single_loads.paper("beam_svk"), *rows], found, tmp_path / "a")
-    with (tmp_path / "a.csv").open() as file:
-        written = list(csv.DictReader(file))
-    assert [row["method"] for row in written] == [
-        "paper, beam (a)", "paper, beam (b)", "near", "far",
-    ]  # fmt: skip
-    assert (tmp_path / "a.json").is_file()
+    rows = [*single_loads.paper("beam_svk"), *rows]
+    single_loads.draw(scene, batch, found, rows, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size < 300_000
     width, height = Image.open(tmp_path / "a.png").size
     assert width > 2 * height
-
-
-def test_the_command_measures_every_run(script, tiny_training, tmp_path):
-    common = ["data.folder=data", "trainer.max_epochs=1"]
-    for name in ("a", "b"):
-        ended = script("train", *tiny_training, *common, f"run=runs/tiny/{name}", cwd=tmp_path)
-        assert ended.status == 0, ended.err[-2000:]
-    ended = script("results", "name=tiny", "single=true", "folder=out", cwd=tmp_path)
-    assert ended.status == 0, ended.err[-2000:]
-    with (tmp_path / "out" / "tiny_single.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["method"] for row in rows] == ["a", "b"]
-    assert rows[0]["load"] == rows[1]["load"]
-    assert (tmp_path / "out" / "tiny_single.png").is_file()
-    assert not (tmp_path / "out" / "tiny.csv").exists()

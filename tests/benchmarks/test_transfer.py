@@ -1,8 +1,6 @@
 """Laws of the comparison of networks on other families of loads."""
 
-import csv
 import runpy
-import shutil
 import sys
 from pathlib import Path
 
@@ -13,8 +11,6 @@ from PIL import Image
 from benchmarks import transfer
 from dpl import Sample
 from dpl.fem import solve
-
-TINY = ["mesh.nodes=[5,3,3]", "data.train=4", "data.val=2", "data.test=3", "data.workers=0"]
 
 
 @pytest.fixture(scope="module")
@@ -76,25 +72,3 @@ def test_a_matrix_is_drawn_for_each_network(tmp_path):
     one = Image.open(tmp_path / "t.png").size
     transfer.draw(rows[:3], tmp_path / "t.png")
     assert Image.open(tmp_path / "t.png").size[0] < one[0]
-
-
-def test_the_command_measures_all_pairs(script, tmp_path):
-    for family in ("modal", "modal_small"):
-        run = f"run=runs/families/{family}/unrolled"
-        ended = script("train", "model=unrolled", f"loads={family}", *TINY, run, cwd=tmp_path)
-        assert ended.status == 0, ended.err
-    ended = script("transfer", "folder=out", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    with (tmp_path / "out/transfer.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    pairs = [(row["trained_on"], row["tested_on"]) for row in rows]
-    names = ("modal", "modal_small")
-    assert pairs == [(a, b) for a in names for b in names]
-    assert all(row["converged"] == "100" for row in rows)
-    assert (tmp_path / "out/transfer.png").is_file()
-
-    shutil.rmtree(tmp_path / "runs")
-    ended = script("transfer", cwd=tmp_path)
-    assert ended.status != 0
-    assert "run = runs/families contains no runs" in ended.err
-    assert len(ended.err.strip().splitlines()) == 1

@@ -23,7 +23,6 @@ from dpl.fem import (
     NeoHookeanLn,
     Newton,
     Plane,
-    PODGalerkin,
     Problem,
     Solution,
     Status,
@@ -61,8 +60,6 @@ def solvers(newton, load):
     exact = solve(newton, load).displacement
     assert 0.05 < exact.norm(dim=-1).max() < 0.5
     problem, guess = newton.problem, 1.001 * exact
-    snapshots = torch.cat([part * exact for part in (0.5, 0.8, 1.0)])
-    reduced = PODGalerkin.fit(problem, snapshots, 3, tolerance=None, lift=newton.linear_solver)
     hybrids = {rule: Hybrid(lambda load: guess, newton, rule) for rule in RULES}
     hybrids["steps"] = Hybrid(lambda load: guess, newton, steps=AndersonSolver(newton))
     return {
@@ -70,14 +67,13 @@ def solvers(newton, load):
         "newton from a guess": lambda load: [*newton.iterate(load, guess=guess)][-1],
         "accelerated": lambda load: [*AndersonSolver(newton).iterate(load, guess=guess)][-1],
         "linear": partial(solve, newton.linear_solver),
-        "reduced": partial(solve, reduced),
         "direct": partial(solve, Direct(lambda load: guess, problem)),
         **{f"hybrid, {name}": partial(solve, hybrid) for name, hybrid in hybrids.items()},
     }
 
 
 SOLVERS = [
-    *("newton", "newton from a guess", "accelerated", "linear", "reduced", "direct"),
+    *("newton", "newton from a guess", "accelerated", "linear", "direct"),
     *("hybrid, natural_monotonicity", "hybrid, paper", "hybrid, steps"),
 ]
 
@@ -107,7 +103,7 @@ def test_forces_on_held_nodes_alone_leave_the_body_at_rest(newton, load, solvers
 
 
 @pytest.mark.parametrize("power", [-280, -158, -100])
-@pytest.mark.parametrize("name", ["newton", "linear", "reduced"])
+@pytest.mark.parametrize("name", ["newton", "linear"])
 def test_tiny_loads_are_answered_as_small_ones_are(newton, load, solvers, name, power):
     size = 10.0**power
     tiny = load._replace(force=size * load.force)
@@ -138,9 +134,6 @@ TAKERS = {
     "changed newton": lambda newton, tol: replace(newton, tol=tol),
     "linear": lambda newton, tol: LinearSolver(newton.problem, tol=tol),
     "direct": lambda newton, tol: Direct(lambda load: load.force, newton.problem, tol),
-    "reduced": lambda newton, tol: PODGalerkin(
-        newton.problem, torch.zeros(*newton.problem.shape, 1), tol=tol
-    ),
     "view settings": lambda newton, tol: ViewSettings(tol=tol),
     "judge": lambda newton, tol: evaluate_solution(
         newton.problem,

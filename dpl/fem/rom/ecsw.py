@@ -211,7 +211,6 @@ class ReducedMesh:
         )
         self.basis = vectors[nodes].flatten(0, 1).contiguous()
         self._size = per_cell * dim
-        self._single = self.basis.float()
         row, column = np.triu_indices(self._size)
         self._upper = torch.from_numpy(row * self._size + column)
         self._half = torch.from_numpy(np.where(row == column, 0.5, 1.0))
@@ -220,21 +219,11 @@ class ReducedMesh:
         """Return values (C A D,) as nodal displacements (1, C A, D)."""
         return values.view(1, *self.problem.shape)
 
-    def project(self, force: Tensor) -> Tensor:
-        """Return V^T f, (R,), of nodal forces (C A D,) in any shape."""
-        return force.flatten() @ self.basis
-
     def tangents(self, entries: Tensor) -> Tensor:
         """Return U, (C, A D, A D), with U + U^T the cells' matrices, of their entries (nnz,)."""
         upper = entries.new_zeros(len(entries) // len(self._upper), self._size**2)
         upper[:, self._upper] = entries.view(-1, len(self._upper)) * self._half
         return upper.view(-1, self._size, self._size)
-
-    def reduced(self, upper: Tensor) -> Tensor:
-        """Return V^T K V, (R, R), in the accuracy of float32, in half the time of float64."""
-        rows = self._single.view(len(upper), self._size, -1)
-        product = self._single.T @ (upper.float() @ rows).flatten(0, 1)
-        return (product + product.T).double()
 
     def product(self, upper: Tensor, values: Tensor) -> Tensor:
         """Return K v of v, (C A D, k) or (C A D,)."""
