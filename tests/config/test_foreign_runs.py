@@ -1,5 +1,6 @@
 """The folder of a run of somebody else is data: a command calls nothing that the file names."""
 
+import itertools
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
@@ -125,8 +126,14 @@ READERS = {  # arguments of the commands that read a run
 }
 
 
-@pytest.mark.parametrize("key", ["trainer.profiler", "callbacks.more", "loads.amplitude"])
-@pytest.mark.parametrize("command", [*READERS, "load"])
+@pytest.mark.parametrize(
+    ("command", "key"),
+    zip(
+        ["load", *READERS],
+        itertools.cycle(["trainer.profiler", "callbacks.more", "loads.amplitude"]),
+        strict=False,
+    ),
+)
 def test_no_command_calls_what_a_run_names(command, key, run, module, script, tmp_path):
     run(key, {"_target_": FOREIGN})
     if command == "load":

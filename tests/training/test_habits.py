@@ -349,9 +349,9 @@ def test_a_run_with_a_time_limit_is_evaluated_and_resumed(train, home):
 
 def test_a_schedule_that_does_not_end_with_the_time_is_refused(train):
     limit = ["trainer.max_epochs=-1", "trainer.max_time=00:01:00", "~scheduler.warmup"]
-    linear = "scheduler._target_=torch.optim.lr_scheduler.LinearLR"
-    ended = train("invalid", *limit, linear, status=2)
-    assert "LinearLR does not follow trainer.max_time" in ended.err
+    other = ["scheduler._target_=torch.optim.lr_scheduler.OneCycleLR", "+scheduler.max_lr=1e-3"]
+    ended = train("invalid", *limit, *other, status=2)
+    assert "OneCycleLR does not follow trainer.max_time" in ended.err
     assert "Traceback" not in ended.err
 
 
