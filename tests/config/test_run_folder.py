@@ -355,7 +355,7 @@ def test_generation_imports_neither_lightning_nor_matplotlib(tmp_path, environme
 
 
 @pytest.mark.skipif(
-    importlib.util.find_spec("hydra_plugins.hydra_optuna_sweeper") is not None,
+    importlib.util.find_spec("optuna") is not None,
     reason="Optuna is installed",
 )
 @pytest.mark.parametrize("argument", ["hparams_search=pod", "hydra/sweeper=optuna"])
