@@ -3,27 +3,25 @@
 import contextlib
 import errno
 import functools
-import importlib
 import logging
 import math
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from yaml import YAMLError
 
 from dpl import config
 from dpl.commands import dry_run, help_text
 from dpl.config import CONF, ConfigError, Keys
 from dpl.system.files import DataSetError
-from dpl.version import install
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
@@ -57,7 +55,6 @@ def command(
             os.environ["DPL_CONF"] = str(CONF)
             with readable_errors():
                 args = dry_run.arguments_of(sys.argv[1:], name, conf)
-                check_sweep(args.overrides)
                 if args.hydra_help or args.shell_completion or args.experimental_rerun:
                     return by_hydra()
                 with dry_run.initialized(args) as engine:
@@ -143,27 +140,9 @@ def _drop_empty(folder: Path) -> None:
             folder = folder.parent
 
 
-def check_sweep(overrides: Sequence[str]) -> None:
-    """Raise a `ConfigError` with the remedy if a command line needs Optuna and it is missing."""
-    needs = ("hparams_search=", "+hparams_search=", "hydra/sweeper=optuna")
-    if not any(one.startswith(needs) for one in overrides):
-        return
-    try:
-        importlib.import_module("hydra_plugins.hydra_optuna_sweeper._impl")
-    except ImportError as error:
-        reason = f"Optuna cannot be used ({error}): {install('sweep')}"
-        raise ConfigError(f"hparams_search: {reason}") from error
-
-
-def apply_extras(cfg: DictConfig) -> None:
-    """Apply the group `extras`: print the configuration, ask for tags, silence warnings.
-
-    Raises:
-        ConfigError: `extras.view` cannot be done at the end.
-    """
+def check_extras(cfg: DictConfig) -> None:
+    """Raise a `ConfigError` if `extras` needs tags that are missing or a viewer that cannot run."""
     extras = cfg.get("extras") or {}
-    if extras.get("ignore_warnings"):
-        warnings.filterwarnings("ignore")
     if extras.get("enforce_tags") and not cfg.tags:
         raise ConfigError("tags = [] must name one tag or more; or set extras.enforce_tags=false")
     if extras.get("view"):
@@ -172,8 +151,6 @@ def apply_extras(cfg: DictConfig) -> None:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             raise ConfigError("extras.view = true needs one run; leave it out of a sweep")
         require_viewer()
-    if extras.get("print_config"):
-        print(OmegaConf.to_yaml(cfg, resolve=True))
 
 
 def check_trainer(trainer: Any, cfg: DictConfig) -> None:

@@ -88,7 +88,7 @@ def check(
     if args.cfg or args.info is not None:
         return None
     place = _folder(first, "run" if jobs is None else "sweep")
-    every = [_job(cfg) for cfg in ([first] if jobs is None else jobs)]
+    every = [overrides.job(cfg) for cfg in ([first] if jobs is None else jobs)]
     for cfg in every:
         config.check(cfg, keys=keys)
     if jobs is not None and rehearse is not None and REMOTE not in str(first.hydra.launcher):
@@ -152,14 +152,6 @@ def _one_by_one(values: list[list[str]]) -> Iterator[tuple[str, ...]]:
     for place, some in enumerate(values):
         for value in some[1:]:
             yield (*first[:place], value, *first[place + 1 :])
-
-
-def _job(cfg: DictConfig) -> DictConfig:
-    """Return the configuration of a job without the node `hydra`, which sets `folder` later."""
-    job = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
-    if "folder" in job and OmegaConf.is_interpolation(job, "folder"):
-        job.folder = "."
-    return job
 
 
 def _folder(cfg: DictConfig, mode: str) -> Path:

@@ -1,11 +1,8 @@
 """Parse and compose the overrides of a command line; explain invalid ones in one line.
 
-Hydra explains an invalid override in several lines, with advice that the next check may refuse.
 All functions need an initialised Hydra (`dpl.commands.dry_run.initialized`).
 """
 
-import contextlib
-import difflib
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,6 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from dpl import config
 from dpl.config import ConfigError, validation
 from dpl.version import install
 
@@ -56,19 +54,62 @@ def parsed(line: str) -> Override:
 def composed(name: str, lines: Sequence[str]) -> DictConfig:
     """Return the configuration of a command with overrides, including the node `hydra`.
 
+    Where Hydra refuses a key, it advises to add it by `+`. All keys are then added, so that
+    `validation` finds the one that does not exist; its message is more useful.
+
     Raises a `ConfigError` if an override cannot be applied.
     """
+    refusal: ConfigError | None = None
     try:
         cfg = hydra.compose(name, overrides=list(lines), return_hydra_config=True)
     except REFUSED as error:
-        raise ConfigError(_reason(name, [parsed(line) for line in lines], error)) from error
-    added = [one.partition("=")[0].lstrip("+") for one in lines if one.startswith("+")]
-    if new := [key for key in added if "." not in key and not options(name, key)]:
+        forced = [_with_force(name, parsed(line)) for line in lines]
+        refusal = ConfigError(_in_one_line(str(error)))
+        try:
+            cfg = hydra.compose(name, overrides=forced, return_hydra_config=True)
+        except REFUSED:
+            raise refusal from error
+    added = [line for line in lines if line[0] != "~" and (line[0] == "+" or refusal)]
+    keys = {line.lstrip("+").partition("=")[0] for line in added}
+    if new := {key for key in keys if "." not in key and not options(name, key)}:
         known = {str(key) for key in hydra.compose(name)}
-        for key in set(new) - known:
+        for key in new - known:
             message = validation.suggestion(key, known)
             raise ConfigError(f"{key}: this command has no such key; {message}")
+    if refusal is not None:
+        config.check(job(cfg), keys=[(object, " ".join(map(str, cfg)))])
+        raise refusal
     return cfg
+
+
+def job(cfg: DictConfig) -> DictConfig:
+    """Return the configuration of a job without the node `hydra`, which sets `folder` later."""
+    found = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    if "folder" in found and OmegaConf.is_interpolation(found, "folder"):
+        found.folder = "."
+    return found
+
+
+def _with_force(name: str, one: Override) -> str:
+    """Return an override that adds its key if it does not exist; raise for an invalid option."""
+    group, line = one.key_or_group, one.input_line or ""
+    if one.is_delete():
+        return line
+    if not (known := options(name, group)):
+        return f"++{line.lstrip('+')}"
+    if not isinstance(one.value(), str | list):
+        raise ConfigError(f"{line} must be one of {', '.join(known)}; ~{group} leaves it out")
+    return line
+
+
+def _in_one_line(message: str) -> str:
+    """Return a message of Hydra, with the remedy where the option of a plugin is missing."""
+    lines = message.partition("Config search path")[0].splitlines()
+    text = " ".join(line.strip() for line in lines if line and "full_key" not in line)
+    for group, extra in EXTRAS.items():
+        if f"'{group}/" in text:
+            text += f"; more come with {install(extra)}"
+    return text
 
 
 def values(one: Override, *, search: bool) -> list[str]:
@@ -86,61 +127,3 @@ def values(one: Override, *, search: bool) -> list[str]:
     if not found:
         raise ConfigError(f"{one.input_line} must name one value or more; it names none")
     return [f"{one.get_key_element()}={value}" for value in found]
-
-
-def _reason(name: str, requested: list[Override], error: Exception) -> str:
-    """Return one line: the nearest name of an unknown key or option, else the message of Hydra."""
-    groups = [one for one in requested if options(name, one.key_or_group)]
-    for one in groups:
-        if not one.is_delete() and (message := _bad_option(one, options(name, one.key_or_group))):
-            return message
-    with contextlib.suppress(*REFUSED):
-        ways = [one for one in requested if one.key_or_group == "hydra.searchpath"]
-        chosen = [one for one in groups if one.key_or_group in hydra.compose(name)]
-        lines = [one.input_line for one in (*ways, *chosen)]
-        base = hydra.compose(name, overrides=lines, return_hydra_config=True)
-        known = {*base, *base.hydra.runtime.choices}
-        for one in requested:
-            key = one.key_or_group
-            is_new = one.is_add() or one.is_force_add() or "/" in key or key in known
-            if not is_new and (message := _unknown(key, base)):
-                return message
-    message = str(error).partition("Config search path")[0]
-    return " ".join(line.strip() for line in message.splitlines() if "full_key" not in line)
-
-
-def _bad_option(one: Override, known: list[str]) -> str | None:
-    """Return the problem of the choice of an option, None if it is valid."""
-    value, group = one.value(), one.key_or_group
-    if isinstance(value, list) or value in known:
-        return None
-    near = difflib.get_close_matches(str(value), known, 1)
-    advice = f"did you mean {near[0]}? " if near else ""
-    message = f"{group} = {'null' if value is None else value}: there is no such option; "
-    message += f"{advice}{group} is one of {', '.join(known)}"
-    if value is None:
-        message += f"; ~{group} leaves it out"
-    return f"{message}; more come with {install(EXTRAS[group])}" if group in EXTRAS else message
-
-
-def _unknown(key: str, base: DictConfig) -> str | None:
-    """Return the advice for a key that does not exist in a configuration, None if it may."""
-    node: Any = OmegaConf.to_container(base)
-    place = ""
-    for part in key.split("."):
-        known = _below(node)
-        if part not in known:
-            more = validation.options_of(node) if isinstance(node, dict) else set()
-            names = {name for name in known if name[0] != "_"} - {"hydra"} | more
-            if part in more or not names:
-                return None
-            return f"{key}: there is no such key; {validation.suggestion(part, names, place)}"
-        node, place = known[part], f"{place}{part}."
-    return None
-
-
-def _below(node: Any) -> dict[str, Any]:
-    """Return the entries of a node by name or number."""
-    if isinstance(node, list):
-        node = dict(enumerate(node))
-    return {str(key): one for key, one in node.items()} if isinstance(node, dict) else {}

@@ -57,7 +57,7 @@ def main(cfg: DictConfig) -> float | None:
     """Train and evaluate a surrogate; return its smallest validation e_mean [-] to a search."""
     cfg = config.resumed_config(cfg, HydraConfig.get().overrides.task)
     config.check(cfg)
-    cli.apply_extras(cfg)
+    cli.check_extras(cfg)
     try:
         return _train(cfg)
     except training.Diverged as error:

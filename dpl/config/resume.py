@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
@@ -167,24 +166,15 @@ def check_weights(
     Raises:
         ConfigError: The checkpoint cannot be resumed.
     """
-    with error_in("ckpt_path", ValueError, TypeError, AttributeError):
+    with error_in("ckpt_path", ValueError, TypeError, AttributeError, RuntimeError):
         surrogate.on_load_checkpoint(checkpoint)
-    if surrogate.predictor.is_closed_form:
-        if grows:  # the sizes of its buffers are results of the fit
-            return
-        name = type(surrogate.net).__name__
-        raise ConfigError(
-            f"ckpt_path: {name} is fitted in one step and cannot be resumed; remove it"
-        )
-    ours, theirs = (
-        {name: tuple(t.shape) for name, t in state.items() if isinstance(t, torch.Tensor)}
-        for state in (surrogate.state_dict(), checkpoint["state_dict"])
-    )
-    if differing := sorted(dict(ours.items() ^ theirs.items())):
-        raise ConfigError(
-            f"ckpt_path: the checkpoint is of another network: {differing[0]} has shape "
-            f"{theirs.get(differing[0])} there, {ours.get(differing[0])} here"
-        )
+        if not surrogate.predictor.is_closed_form:  # Lightning loads them again
+            surrogate.load_state_dict(checkpoint["state_dict"])
+        elif not grows:  # else the sizes of its buffers are results of the fit
+            name = type(surrogate.net).__name__
+            raise ConfigError(
+                f"ckpt_path: {name} is fitted in one step and cannot be resumed; remove it"
+            )
 
 
 def check_callbacks(trainer: Any, checkpoint: dict[str, Any]) -> None:

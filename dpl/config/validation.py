@@ -41,8 +41,7 @@ KEYS: Keys = (  # of all commands
     (float | Sequence[float] | Mapping[str, float | str], "young", 1e-30, 1e30),  # [Pa]
     (float, "young.low young.high", 1e-30, 1e30),
     (Literal["uniform", "log"], "young.distribution"),
-)
-TRAINING: Keys = (  # of a training; the types are those of signatures, 1e-30 stands for "above 0"
+    # of a training; the types are those of signatures, 1e-30 stands for "above 0"
     (object, "data.train", 1, 10**7),
     (object, "optimizer.lr", 1e-30, 1e6),
     (object, "trainer.max_epochs trainer.max_steps trainer.check_val_every_n_epoch", 1, 10**9),
@@ -151,8 +150,6 @@ def check(
                 raise ConfigError(f"{path} = {value} is not a finite number")
             if isinstance(value, int) and not -(2**63) <= value < 2**63:
                 raise ConfigError(f"{path} = {value} does not fit into 64 bits")
-    if "trainer" in resolved:
-        known |= _by_name(TRAINING)
     for path, node in iter_nodes(resolved):
         if path in known:
             _check_value(path, node, *known[path])

@@ -10,28 +10,25 @@ from hydra.core.global_hydra import GlobalHydra
 from dpl.commands import dry_run, generate, train
 from dpl.config import ConfigError, build
 
-OPTIONS = "model is one of cnn, fcnn, gnn, pod, unrolled"
-EXPERIMENTS = "experiment is one of beam_nh_loss, beam_poisson, beam_svk, "
+OPTIONS = "Available options in 'model': cnn fcnn gnn pod unrolled"
+EXPERIMENTS = "Available options in 'experiment': beam_nh_loss beam_poisson beam_svk "
 NONSENSE = {  # command line -> what the one line says
-    "train experiment=beam_yuong": f"experiment = beam_yuong: .* beam_young\\? {EXPERIMENTS}",
-    "generate experiment=beam_yuong": f"experiment = beam_yuong: .* beam_young\\? {EXPERIMENTS}",
-    "train hparams_search=podd": r"^hparams_search = podd: .* did you mean pod\?",
-    "train modle=fcnn": r"^modle: there is no such key; did you mean model\?$",
+    "train experiment=beam_yuong": f"Could not find 'experiment/beam_yuong' {EXPERIMENTS}",
+    "generate experiment=beam_yuong": f"Could not find 'experiment/beam_yuong' {EXPERIMENTS}",
+    "train hparams_search=podd": r"Could not find 'hparams_search/podd' .*: pod$",
+    "train modle=fcnn": r"^modle: this command has no such key; did you mean model\?$",
     "train +modle=fcnn": r"^modle: this command has no such key; did you mean model\?$",
-    "train ~modle": r"^modle: there is no such key; did you mean model\?$",
+    "train ~modle": r"^Could not delete from config. 'modle' does not exist",
     "train +port=3": r"^port: this command has no such key",
-    "train model=fcn": f"^model = fcn: there is no such option; did you mean fcnn\\? {OPTIONS}$",
-    "train model=xyz": f"^model = xyz: there is no such option; {OPTIONS}$",
-    "train model=3": f"^model = 3: there is no such option; {OPTIONS}$",
-    "train model=null": f"^model = null: there is no such option; {OPTIONS}; ~model leaves it out$",
-    "train fixed=null": r"^fixed = null: .* one of cylinder, plane, tag; ~fixed leaves it",
-    "train fixed=3": r"^fixed = 3: .* one of cylinder, plane, tag$",
-    "generate model=fcnn": r"^model: there is no such key",
-    "train hydra/launcher=jobblib": r"^hydra/launcher = jobblib: .*pip install .*launch",
-    "train hydra.swep.dir=3": r"^hydra\.swep\.dir: .*; did you mean hydra\.sweep\?$",
-    "train model.widht=3": r"^model\.widht: there is no such key; did you mean model\.width\?$",
+    "train model=fcn": f"Could not find 'model/fcn' {OPTIONS}$",
+    "train model=3 model.widht=2": "^model=3 must be one of .*; ~model leaves it out$",
+    "train model=null": r"^model=null must be one of cnn, .*; ~model leaves it out$",
+    "generate model=fcnn": r"^Could not override 'model'",
+    "train hydra/launcher=jobblib": r"'hydra/launcher/jobblib' .*pip install .*launch",
+    "train hydra.swep.dir=3": r"^Could not override 'hydra\.swep\.dir'",
+    "train model.widht=3": r"^model\.widht: .*FCNN has no such .*; did you mean model\.width\?$",
     "train trainer.max_epoch=3": r"did you mean trainer\.max_epochs\?$",
-    "train callbacks.worst.every=3": r"^callbacks\.worst\.every: .*callbacks\.worst_cases\?$",
+    "train callbacks.worst.every=3": r"^callbacks\.worst = {'every': 3} must be a call",
     "train mesh.cell=tetra": r"^Could not override 'mesh\.cell'\. .* use \+mesh\.cell=tetra",
     "train +mesh.cel=tetra": r"^mesh\.cel: .* has no such option; did you mean mesh\.cell\?$",
     "train model=fcnn,cnn": r"^model=fcnn,cnn names several values; add -m",
@@ -50,7 +47,7 @@ NONSENSE = {  # command line -> what the one line says
     "train -m run=file seed=1,2": r"^run = file cannot be written: File exists",
     "train -m seed=range(0)": r"^seed=range\(0\) must name one value or more",
     "train -m optimizer.lr=interval(1e-3,1)": r"^optimizer\.lr=interval.* is a range for a search",
-    "train -m model=fcnn,fcn": r"^model = fcn: there is no such option",
+    "train -m model=fcnn,fcn": r"Could not find 'model/fcn'",
     "train -m data.train=8,0": r"^data\.train = 0 must lie between",
     "train -m seed=0,1 optimizer.lr=1e-3,1e30": r"^optimizer\.lr = 1e\+30 must lie between",
     "train model.base=quadratic": r"^model\.base = 'quadratic' must be one of linear or null",
@@ -62,8 +59,8 @@ NONSENSE = {  # command line -> what the one line says
     "train data=online +data.train.error=1e-3": r"^data\.train\.error: dpl\.data\.Stream has no",
     "generate data._target_=dpl.data.DataModule": r"^data\._target_ = .*dpl\.data\.DataSet",
     "train data._target_=dpl.data.DataSet": r"^data\._target_ = .*dpl\.data\.DataModule",
-    "generate actoin=verify": r"^actoin: there is no such key; did you mean action\?$",
-    "view rn=3": r"^rn: there is no such key; did you mean run\?$",
+    "generate actoin=verify": r"^actoin: this command has no such key; did you mean action\?$",
+    "view rn=3": r"^rn: this command has no such key; did you mean run\?$",
     "evaluate": r"^run is missing",
 }
 PARTS = {"train": train.parts, "generate": generate.parts}
@@ -136,7 +133,7 @@ def test_the_ends_of_the_ranges_of_a_search_are_checked(ask, monkeypatch, tmp_pa
     assert seen == [(1e-3, 2), (2e-2, 2), (1e-3, 6)]
     with pytest.raises(ConfigError, match=r"^optimizer\.lr = 1000000000"):
         ask("train", *search, "optimizer.lr=interval(1e-3,1e9)")
-    with pytest.raises(ConfigError, match=r"^model\.widht: there is no such key"):
+    with pytest.raises(ConfigError, match=r"^model\.widht: "):
         ask("train", *search, "model.widht=choice(1,2)")
 
 
@@ -152,7 +149,7 @@ def test_configurations_beside_those_of_the_package_are_checked_too(ask, tmp_pat
     soft = "_target_: dpl.fem.NeoHookeanLn\npoisson: 0.1\n"
     (tmp_path / "mine/material/soft.yaml").write_text(soft)
     ask("generate", "--config-dir", "mine", "material=soft")
-    with pytest.raises(ConfigError, match=r"did you mean soft\?"):
+    with pytest.raises(ConfigError, match=r"Could not find 'material/sofd' .* soft "):
         ask("generate", "--config-dir", "mine", "material=sofd")
 
 
@@ -187,8 +184,10 @@ def test_a_folder_that_is_read_only_is_refused(tmp_path):
     "line",
     [
         "train modle=fcnn",
-        "train fixed=null",
         "train -m seed=range(0)",
+        "train data.batch_size=0",
+        "train trainer.max_epochs=-1",
+        "generate young=-1",
         "train run=/proc/nope",
         "train data.folder=/dev/null",
         "train ~callbacks",
@@ -203,8 +202,9 @@ def test_a_command_ends_with_one_line_and_2(script, tiny, tmp_path, line):
     assert ended.status == 2
     assert ended.err.startswith("error: ")
     assert ended.err.count("\n") == 1
+    assert "Traceback" not in ended.out
     assert "solving" not in ended.out
-    assert not list(tmp_path.glob("datasets"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_region_may_be_left_out_where_supports_hold_the_body(scene_of, tiny):

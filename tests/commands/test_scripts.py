@@ -329,25 +329,6 @@ def test_ctrl_c_while_generating_ends_with_130_and_keeps_all_that_was_solved(
     assert session["loads"] == 64 * len(lines) + pending
 
 
-@pytest.mark.slow
-def test_a_multirun_trains_each_combination_in_a_folder_of_its_own(start, tiny_training, tmp_path):
-    sweep = ["-m", "loss=mse,lr_star", "seed=0,1"]
-    process = start(
-        "train", *sweep, *tiny_training, "trainer.max_epochs=1", "run=sweep", cwd=tmp_path
-    )
-    status, _, err = finish(process)
-    assert status == 0, err[-2000:]
-    folders = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
-    assert len(folders) == 4
-    seen = {
-        (cfg.loss._target_.rpartition(".")[2], cfg.seed)
-        for cfg in (OmegaConf.load(folder / "config.yaml") for folder in folders)
-    }
-    assert seen == {("MSE", 0), ("MSE", 1), ("LrStar", 0), ("LrStar", 1)}
-    assert all((folder / "evaluation.json").exists() for folder in folders)
-    assert len(list((tmp_path / "datasets").iterdir())) == 1, "they share the data set"
-
-
 # ------------------------------------------------------------------ sweeps
 
 

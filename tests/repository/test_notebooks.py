@@ -2,7 +2,6 @@
 
 import importlib
 import re
-import time
 from pathlib import Path
 
 import nbformat
@@ -71,7 +70,11 @@ def test_a_notebook_links_to_what_is_there(path):
         assert (path.parent / target).is_file()
 
 
-@every
+@pytest.mark.parametrize(
+    "path",
+    [NOTEBOOKS[0], *(pytest.param(path, marks=pytest.mark.slow) for path in NOTEBOOKS[1:])],
+    ids=lambda path: path.stem,
+)
 @pytest.mark.timeout(1200)
 def test_a_notebook_runs_and_leaves_nothing_behind(path, tmp_path, monkeypatch, environment):
     """Its assertions hold; it draws, warns of nothing and works outside the repository."""
@@ -81,9 +84,7 @@ def test_a_notebook_runs_and_leaves_nothing_behind(path, tmp_path, monkeypatch, 
     before = _files()
     notebook = nbformat.read(path, as_version=4)
     place = {"metadata": {"path": str(tmp_path)}}
-    start = time.perf_counter()
     NotebookClient(notebook, timeout=SECONDS, kernel_name="python3", resources=place).execute()
-    print(f"{path.name}: {time.perf_counter() - start:.1f} s")
     outputs = [out for cell in notebook.cells for out in cell.get("outputs", [])]
     stored = nbformat.read(path, as_version=4).cells
     assert [has_figure(cell) for cell in notebook.cells] == [has_figure(cell) for cell in stored]
