@@ -9,42 +9,28 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from dpl.fem import (
-    DirichletBC,
-    LinearSolver,
-    Load,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Status,
-    Traction,
-    box,
-    rectangle,
-    solve,
-)
+from dpl import fem
 
-NH, SVK = NeoHookeanLn(0.3), SaintVenantKirchhoff(0.3)
+NH, SVK = fem.NeoHookeanLn(0.3), fem.SaintVenantKirchhoff(0.3)
 
 
 def body(dim=3, law=NH, degree=1, **more):
     """Return a slender clamped body, four times as long as high."""
-    mesh = box([4.0, 1.0, 1.0], [9, 3, 3]) if dim == 3 else rectangle([4.0, 1.0], [13, 4])
-    return Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree, **more)
+    mesh = fem.box([4.0, 1.0, 1.0], [9, 3, 3]) if dim == 3 else fem.rectangle([4.0, 1.0], [13, 4])
+    return fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=degree, **more)
 
 
 def bend(problem, total):
     """Return a load across the far end, `total` over E L^2."""
     direction = torch.zeros(problem.shape[1])
     direction[-1] = -total * 16
-    force = Traction(Plane(0, "max"), direction.tolist()).on(problem)
-    return Load(force[None], torch.ones(1, dtype=torch.float64))
+    force = fem.Traction(fem.Plane(0, "max"), direction.tolist()).on(problem)
+    return fem.Load(force[None], torch.ones(1, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0, 3.0])
+@pytest.mark.parametrize("angle", [1e-3, 3.0])
 def test_nodes_are_rotated_by_the_rotation_of_their_gradient(dim, degree, angle):
     problem = body(dim, degree=degree)
     axis = np.array([1.0, 2.0, 3.0]) / math.sqrt(14)
@@ -54,7 +40,7 @@ def test_nodes_are_rotated_by_the_rotation_of_their_gradient(dim, degree, angle)
         turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     stretch = np.diag([1.3, 0.8, 1.1][:dim])
     u = problem.points @ torch.from_numpy(turn @ stretch - np.eye(dim)).T
-    rotated = LinearSolver(problem).corotational.at(u[None])
+    rotated = fem.LinearSolver(problem).corotational.at(u[None])
     whole = problem.free.all(dim=1).numpy()
     assert np.allclose(rotated.rotations[whole], turn, atol=1e-8)
     assert np.array_equal(
@@ -66,33 +52,33 @@ def test_nodes_are_rotated_by_the_rotation_of_their_gradient(dim, degree, angle)
 def test_a_node_fixed_in_one_direction_is_rotated_about_it(axis):
     sides = [None, None, None]
     sides[axis] = 0.0
-    problem = body(supports=[DirichletBC(Plane(1, "min"), sides)])
+    problem = body(supports=[fem.DirichletBC(fem.Plane(1, "min"), sides)])
     turn = Rotation.from_rotvec(0.7 * np.eye(3)[axis]).as_matrix()
     u = problem.points @ torch.from_numpy(turn - np.eye(3)).T
-    rotated = LinearSolver(problem).corotational.at(u[None])
+    rotated = fem.LinearSolver(problem).corotational.at(u[None])
     partly = (problem.free.sum(dim=1) == 2).numpy()
     assert partly.sum() > 10
     assert np.allclose(rotated.rotations[partly], turn, atol=1e-8)
 
 
 def test_a_node_fixed_in_two_directions_is_not_rotated():
-    problem = body(supports=[DirichletBC(Plane(1, "min"), [0.0, 0.0, None])])
+    problem = body(supports=[fem.DirichletBC(fem.Plane(1, "min"), [0.0, 0.0, None])])
     turn = Rotation.from_rotvec([0.2, 0.3, 0.4]).as_matrix()
     u = problem.points @ torch.from_numpy(turn - np.eye(3)).T
-    rotated = LinearSolver(problem).corotational.at(u[None])
+    rotated = fem.LinearSolver(problem).corotational.at(u[None])
     fixed = (problem.free.sum(dim=1) < 2).numpy()
     assert np.array_equal(rotated.rotations[fixed], np.tile(np.eye(3), (fixed.sum(), 1, 1)))
 
 
 def test_nodes_of_an_inverted_body_are_not_rotated():
     problem = body()
-    rotated = LinearSolver(problem).corotational.at(-2.0 * problem.points[None])
+    rotated = fem.LinearSolver(problem).corotational.at(-2.0 * problem.points[None])
     assert np.array_equal(rotated.rotations, np.broadcast_to(np.eye(3), rotated.rotations.shape))
 
 
 def test_at_rest_the_preconditioner_is_the_inverse_of_the_stiffness():
     problem = body()
-    linear = LinearSolver(problem)
+    linear = fem.LinearSolver(problem)
     zero = torch.zeros(1, *problem.shape, dtype=torch.float64)
     right = np.random.default_rng(0).standard_normal(problem.pattern.size)
     ours, exact = linear.corotational.at(zero).apply(right), linear.factor.solve(right)
@@ -106,7 +92,7 @@ def test_the_preconditioner_is_symmetric_and_positive_definite(dim, backend):
     problem = body(dim)
     random = np.random.default_rng(1)
     u = torch.from_numpy(0.02 * random.standard_normal((1, *problem.shape)))
-    rotated = LinearSolver(problem, linear=backend).corotational.at(u)
+    rotated = fem.LinearSolver(problem, linear=backend).corotational.at(u)
     for _ in range(5):
         x, y = random.standard_normal((2, problem.pattern.size))
         size = np.linalg.norm(x) * np.linalg.norm(rotated.apply(y))
@@ -124,15 +110,15 @@ def test_the_preconditioner_is_symmetric_and_positive_definite(dim, backend):
         (True, {"degree": 2}),
         (False, {"dim": 2, "degree": 2}),
         (False, {"mean_dilatation": True}),
-        (True, {"law": NeoHookeanLn(0.49), "mean_dilatation": True}),
+        (True, {"law": fem.NeoHookeanLn(0.49), "mean_dilatation": True}),
     ],
     ids=str,
 )
 def test_newton_has_the_same_solution_with_the_preconditioner(options, mixed):
     problem = body(**options)
     load = bend(problem, 1e-4 if problem.shape[1] == 3 else 5e-4)
-    plain = Newton(problem, mixed_integration=mixed)
-    ours, theirs = solve(replace(plain, corotational=True), load), solve(plain, load)
+    plain = fem.Newton(problem, mixed_integration=mixed)
+    ours, theirs = fem.solve(replace(plain, corotational=True), load), fem.solve(plain, load)
     assert theirs.displacement.norm(dim=-1).max() > 0.09, "or it would prove nothing"
     assert ours.converged.all()
     assert (ours.residual < 1e-8).all()
@@ -142,8 +128,8 @@ def test_newton_has_the_same_solution_with_the_preconditioner(options, mixed):
 
 def test_rotation_halves_the_iterations_far_from_rest(monkeypatch):
     problem = body()
-    answer = solve(Newton(problem), bend(problem, 4e-4)).displacement
-    preconditioner = LinearSolver(problem).corotational
+    answer = fem.solve(fem.Newton(problem), bend(problem, 4e-4)).displacement
+    preconditioner = fem.LinearSolver(problem).corotational
     rotated = preconditioner.count_iterations(answer)
     monkeypatch.setattr(type(preconditioner), "at", lambda self, u: self.factor)
     assert rotated <= 8
@@ -152,11 +138,13 @@ def test_rotation_halves_the_iterations_far_from_rest(monkeypatch):
 
 def test_a_tangent_is_factorised_where_the_preconditioner_is_poor():
     """In a plate of thickness 1/100 the errors of the rotations cause large strains."""
-    problem = Problem.build(box([1.0, 0.2, 0.01], [17, 5, 2]), NH, fixed=Plane(0, "min"))
-    force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
-    load = Load(force[None], torch.ones(1, dtype=torch.float64))
-    plain = Newton(problem)
-    ours, theirs = solve(replace(plain, corotational=True), load), solve(plain, load)
+    problem = fem.Problem.build(
+        fem.box([1.0, 0.2, 0.01], [17, 5, 2]), NH, fixed=fem.Plane(0, "min")
+    )
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
+    load = fem.Load(force[None], torch.ones(1, dtype=torch.float64))
+    plain = fem.Newton(problem)
+    ours, theirs = fem.solve(replace(plain, corotational=True), load), fem.solve(plain, load)
     assert ours.factorisations.all()
     assert ours.converged.all()
     assert torch.allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-8)
@@ -165,24 +153,30 @@ def test_a_tangent_is_factorised_where_the_preconditioner_is_poor():
 def test_stability_is_unknown_without_a_factor():
     problem = body()
     load = bend(problem, 2e-4)
-    ours, theirs = solve(Newton(problem, corotational=True), load), solve(Newton(problem), load)
+    ours, theirs = (
+        fem.solve(fem.Newton(problem, corotational=True), load),
+        fem.solve(fem.Newton(problem), load),
+    )
     assert not ours.factorisations.any()
     assert ours.negative_pivots.tolist() == [-1]
     assert theirs.negative_pivots.tolist() == [0]
-    assert ours.status.tolist() == [int(Status.CONVERGED)]
+    assert ours.status.tolist() == [int(fem.Status.CONVERGED)]
 
 
 def test_moved_supports_work_with_the_preconditioner():
-    shift = DirichletBC(Plane(0, "max"), [0.0, 0.0, -0.6])
+    shift = fem.DirichletBC(fem.Plane(0, "max"), [0.0, 0.0, -0.6])
     problem = body(supports=[shift])
-    none = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
-    ours, theirs = solve(Newton(problem, corotational=True), none), solve(Newton(problem), none)
+    none = fem.Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
+    ours, theirs = (
+        fem.solve(fem.Newton(problem, corotational=True), none),
+        fem.solve(fem.Newton(problem), none),
+    )
     assert ours.converged.all()
     assert torch.allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-8)
 
 
 def test_replaced_attributes_keep_the_linear_solver():
-    newton = Newton(body())
+    newton = fem.Newton(body())
     other = replace(newton, tol=1e-3, corotational=True)
     assert (other.tol, other.corotational) == (1e-3, True)
     assert other.linear_solver is newton.linear_solver
@@ -190,24 +184,17 @@ def test_replaced_attributes_keep_the_linear_solver():
 
 
 def test_another_backend_or_body_has_a_linear_solver_of_its_own():
-    newton = Newton(body())
+    newton = fem.Newton(body())
     for other in (replace(newton, linear="superlu"), replace(newton, problem=body(law=SVK))):
         assert other.linear_solver is not newton.linear_solver
         assert other.linear_solver.problem is other.problem
         assert other.linear_solver.linear == other.linear
 
 
-def test_the_preconditioner_maps_zero_to_zero():
-    problem = body()
-    right = problem.restrict(torch.zeros(problem.shape, dtype=torch.float64))
-    zero = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    assert not LinearSolver(problem).corotational.at(zero).apply(right).any()
-
-
 def test_rotations_do_not_depend_on_the_memory_of_the_problem():
     """Sending a problem to a process moves its tensors, so compiled loops read copies."""
     problem = body()
-    preconditioner = Newton(problem).linear_solver.corotational
+    preconditioner = fem.Newton(problem).linear_solver.corotational
     u = 0.1 * problem.points.roll(1, dims=1)[None] * problem.free
     before = preconditioner.at(u).rotations.copy()
     kept = preconditioner._cell_means[2]

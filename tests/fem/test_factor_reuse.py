@@ -4,11 +4,12 @@ import math
 import pickle
 from dataclasses import replace
 from functools import cache, partial
-from itertools import pairwise
+from itertools import cycle, pairwise
 
 import numpy as np
 import pytest
 import torch
+from laws import LAWS
 from torch import Tensor
 
 from dpl import fem
@@ -62,18 +63,21 @@ def mixed(request) -> bool:
     return request.param
 
 
-@pytest.mark.parametrize("q", [1.0, 20.0, 80.0])
-def test_solution_of_any_law_does_not_depend_on_reuse(beam, pull, any_law, mixed, q):
-    problem = beam(any_law)
+@pytest.mark.parametrize(
+    ("name", "q", "mixed"),
+    [("neo_hookean_ln", q, mixed) for q in (1.0, 20.0, 80.0) for mixed in (False, True)]
+    + list(zip(LAWS, cycle([80.0, 20.0, 1.0]), cycle([True, False]))),
+)
+def test_solution_of_any_law_does_not_depend_on_reuse(beam, pull, name, q, mixed):
+    problem = beam(LAWS[name])
     every, few = pair(problem, load_of(pull(problem, q)[0]), mixed_integration=mixed)
     assert every.converged.all()
     check(every, few, fewer=every.iterations.item() > 2)
 
 
-@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
-@pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("size", [0.01, 0.1])
-def test_solution_on_any_element_does_not_depend_on_reuse(grid, cell, degree, size):
+def test_solution_on_any_element_does_not_depend_on_reuse(grid, kind, size):
+    cell, degree = kind
     mesh = grid(cell, 3, 0.2, inside=True)
     problem = fem.Problem.build(mesh, NH, fixed=fem.Plane(0, "min"), degree=degree)
     across = [0.0] * (mesh.dim() - 1) + [size]
@@ -83,7 +87,7 @@ def test_solution_on_any_element_does_not_depend_on_reuse(grid, cell, degree, si
 
 
 @pytest.mark.parametrize("name", fem.installed_backends())
-@pytest.mark.parametrize(("cells", "q"), [((8, 2), 5.0), ((8, 2), 160.0), ((16, 4), 40.0)])
+@pytest.mark.parametrize(("cells", "q"), [((8, 2), 160.0), ((16, 4), 40.0)])
 def test_solution_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cells, q):
     problem = beam(NH, *cells)
     every, few = pair(problem, load_of(pull(problem, q)[0]), linear=name)
@@ -106,11 +110,10 @@ def test_large_load_that_takes_steps_does_not_depend_on_reuse(beam, pull, mixed,
     check(every, few, steps=steps, fewer=mixed)
 
 
-@pytest.mark.parametrize("q", [400.0, 1000.0])
-def test_load_without_a_solution_has_none_with_reuse(beam, pull, mixed, q):
+def test_load_without_a_solution_has_none_with_reuse(beam, pull, mixed):
     problem = beam(SVK)
     options = {"min_load_step": 2.0**-6, "mixed_integration": mixed}
-    every, few = pair(problem, load_of(pull(problem, q)[0]), **options)
+    every, few = pair(problem, load_of(pull(problem, 400.0)[0]), **options)
     assert every.status.item() == few.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
     assert 0 < few.load_factor.item() < 1
     assert few.load_factor.item() == pytest.approx(every.load_factor.item(), abs=1e-9)
@@ -130,7 +133,9 @@ def test_moved_supports_are_followed_with_reuse(law, mixed):
         check(every, few)
 
 
-@pytest.mark.parametrize("part", [0.5, 0.9, 1.0001, -0.2])
+@pytest.mark.parametrize(
+    ("law", "part"), [(NH, 0.5), (SVK, 0.9), (NH, 1.0001), (SVK, 1.0001), (NH, -0.2)]
+)
 def test_guess_leads_to_the_same_solution_with_reuse(beam, pull, law, part):
     problem = beam(law)
     load = load_of(pull(problem, 20.0)[0])
@@ -305,15 +310,21 @@ BODIES = {  # body with its unit load, critical load (independent code)
     "cube, nu = .45": (partial(cube, 0.45), 0.7475041023),
     "cube, nu = .49": (partial(cube, 0.49), 0.6804639956),
 }
-BEYOND = (1.0005, 1.001, 1.002, 1.01, 1.05)
+BEYOND = (1.0005, 1.002, 1.05)
 
 
 @pytest.mark.filterwarnings("ignore:linear .* lock")
-@pytest.mark.parametrize("reuse", [0.0, 0.1, 1.0])
 @pytest.mark.parametrize(
-    ("name", "part", "linear"),
-    [(name, part, "superlu") for name in BODIES for part in BEYOND]
-    + [("SVK column", 1.001, linear) for linear in ("band", "band32", "pardiso")],
+    ("name", "part", "linear", "reuse"),
+    [
+        (name, part, "superlu", (0.0, 0.1, 1.0)[(row + column) % 3])
+        for row, name in enumerate(BODIES)
+        for column, part in enumerate(BEYOND)
+    ]
+    + [
+        ("SVK column", 1.001, linear, reuse)
+        for linear, reuse in (("band", 0.1), ("band32", 1.0), ("pardiso", 0.1))
+    ],
 )
 def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, linear, reuse):
     """The column, and the cube of Rivlin (1948)."""
@@ -333,18 +344,16 @@ def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, l
 
 @pytest.mark.filterwarnings("ignore:linear .* lock")
 @pytest.mark.parametrize("name", BODIES)
-@pytest.mark.parametrize("part", [0.9, 0.999])
-def test_load_below_a_critical_one_is_stable_whatever_is_reused(name, part):
+def test_load_below_a_critical_one_is_stable_whatever_is_reused(name):
     build, critical = BODIES[name]
     problem, unit = build()
-    every, few = pair(problem, load_of(part * critical * unit), tol=1e-10)
+    every, few = pair(problem, load_of(0.999 * critical * unit), tol=1e-10)
     assert negative(problem, few.displacement) == 0
     assert few.status.item() == fem.Status.CONVERGED
     check(every, few, fewer=False)
 
 
-@pytest.mark.parametrize("P", [2.1, 2.5, 4.0])
-@pytest.mark.parametrize("linear", ["superlu", "band"])
+@pytest.mark.parametrize(("P", "linear"), [(2.1, "superlu"), (2.5, "band"), (4.0, "superlu")])
 def test_factor_with_negative_pivots_is_never_reused(monkeypatch, P, linear):
     """Conjugate gradients need a positive definite preconditioner."""
     problem, unit = column(fem.SaintVenantKirchhoff(0.0))

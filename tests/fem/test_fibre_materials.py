@@ -1,7 +1,7 @@
 """Laws with fibres: derivatives, invariance, closed forms, limits."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import pytest
@@ -30,16 +30,6 @@ EYE = torch.eye(3, dtype=torch.float64)
 ALONG = EYE
 ACROSS = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]).double()
 NORMAL = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]).double()
-
-
-@dataclass(frozen=True)
-class EnergyAlone(fem.Material):
-    """A law of which nothing is known but its energy: derivatives by autodiff."""
-
-    law: fem.Material
-
-    def energy(self, H: Tensor) -> Tensor:
-        return self.law.energy(H)
 
 
 @pytest.fixture
@@ -116,16 +106,6 @@ def test_strain_derivatives_are_those_of_the_energy(fibres, gradients):
     for found, (v, w) in zip(D, pairs, strict=True):
         wanted = 4 * curvature[:, *COMPONENTS[v], *COMPONENTS[w]]
         assert_close(found + 0 * wanted, wanted, rtol=1e-10, atol=1e-10 * size)
-
-
-def test_strain_derivatives_take_plain_numbers(fibres, gradients):
-    """Numbers and tensors go through the same arithmetic."""
-    strain = 2 * green_lagrange(gradients[0, 0, 0])
-    e = tuple(strain[i, j] for i, j in COMPONENTS)
-    numbers = fibres.strain_derivatives(fibres.constants, tuple(map(float, e)))
-    tensors = fibres.strain_derivatives(fibres.constants, e)
-    for found, wanted in zip(sum(numbers, ()), sum(tensors, ()), strict=True):
-        assert found == pytest.approx(float(wanted), rel=1e-13)
 
 
 # ------------------------------------------------------------------ invariance

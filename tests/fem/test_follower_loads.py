@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -30,6 +31,9 @@ OBLIQUE = fem.ConstantFibres([1.0, 0.6, 0.3])
 AROUND = fem.FollowerPressure(lambda points: np.ones(len(points), dtype=bool), 0.3)
 MUSCLE = fem.ActiveStress(0.1, directions=OBLIQUE)
 KINDS = ["closed pressure", "open pressure", "active stress"]
+ELEMENTS = list(product(("triangle", "quad", "tetra", "hexahedron"), (1, 2)))
+BENT = [(KINDS[number % 3], element) for number, element in enumerate(ELEMENTS)]
+BENT += [(KINDS[(number + 1) % 3], element) for number, element in enumerate(ELEMENTS[2:6])]
 
 
 def first_half(points):
@@ -50,11 +54,11 @@ def swirl(points):
     return np.stack([np.cos(x[:, 1]), np.sin(x[:, 0] + x[:, 1]), 0.3 + x[:, 2]], axis=1)
 
 
-@pytest.fixture(params=KINDS)
-def bent(request, kind, grid, bend):
-    """A body of each kind of element under each kind of load, and a displacement."""
-    cell, degree = kind
-    mesh = grid(cell, 2, 0.0 if request.param == "open pressure" else 0.15)
+@pytest.fixture(params=BENT, ids=str)
+def bent(request, grid, bend):
+    """A body of each kind of element under a kind of load, and a displacement."""
+    name, (cell, degree) = request.param
+    mesh = grid(cell, 2, 0.0 if name == "open pressure" else 0.15)
     loads = {
         "closed pressure": [AROUND],
         "open pressure": [fem.FollowerPressure(END, 0.3)],
@@ -62,12 +66,12 @@ def bent(request, kind, grid, bend):
             fem.ActiveStress(0.3, directions=fem.FibreFunction(swirl)),
             fem.ActiveStress(0.2, region=first_half, directions=OBLIQUE),
         ],
-    }[request.param]
-    fixed = None if request.param == "closed pressure" else START
+    }[name]
+    fixed = None if name == "closed pressure" else START
     problem = fem.Problem.build(
         mesh, NH, fixed=fixed, degree=degree, follower_loads=loads, length=1.0
     )
-    return request.param, problem, bend(problem.points, seed=3)
+    return name, problem, bend(problem.points, seed=3)
 
 
 def test_force_is_the_gradient_of_the_work_if_there_is_a_potential(bent):
@@ -261,7 +265,7 @@ def test_active_stress_pressure_and_dead_load_act_together(beam):
     assert residual.norm() < 1e-8 * scale
 
 
-@pytest.mark.parametrize("load", [above(2e-3), above(1e-2), MUSCLE])
+@pytest.mark.parametrize("load", [above(1e-2), MUSCLE])
 def test_gradients_of_solutions_agree_with_differences(beam, load):
     problem = beam(load)
     equilibrium = fem.DifferentiableSolve(fem.Newton(problem, tol=1e-12))
@@ -280,14 +284,6 @@ def test_gradients_of_solutions_agree_with_differences(beam, load):
     assert float((gradient * way).sum()) == pytest.approx(float(slope), rel=3e-5)
 
 
-def test_nothing_changes_without_loads(beam):
-    problem = beam()
-    assert not problem.follower_loads
-    assert problem.under(0.5) is problem
-    assert problem.has_potential
-    assert not problem.force_at_rest.any()
-
-
 @pytest.mark.parametrize(
     ("load", "count"),
     [
@@ -300,13 +296,6 @@ def test_nothing_changes_without_loads(beam):
 def test_follower_loads_count_for_symmetries(grid, load, count):
     problem = fem.Problem.build(grid("hexahedron"), NH, fixed=START, follower_loads=[load])
     assert len(fem.symmetries(problem)) == count
-
-
-def test_pressures_add_up(grid):
-    regions = zip([END, fem.Plane(1, "max"), END], (1, 2, 3), strict=True)
-    loads = [fem.FollowerPressure(region, value) for region, value in regions]
-    force = fem.Problem.build(grid("quad"), NH, follower_loads=loads).force_at_rest.sum(dim=0)
-    assert_close(force, torch.tensor([4.0, 2.0], dtype=torch.float64))
 
 
 def test_directions_are_those_of_the_law_unless_given(grid):
@@ -386,8 +375,9 @@ def test_potential_energy_needs_a_potential(beam):
 # ------------------------------------------------------------------ known solutions
 
 
-@pytest.mark.parametrize("tension", [-0.2, 0.3, 1.5])
-@pytest.mark.parametrize("cell", ["quad", "tetra", "hexahedron"])
+@pytest.mark.parametrize(
+    ("cell", "tension"), [("quad", 0.3), ("tetra", -0.2), ("hexahedron", -0.2), ("hexahedron", 1.5)]
+)
 def test_a_free_block_shortens_as_the_closed_form(cell, tension, grid):
     """P_11 = 0 and P_22 = 0 give the two stretches; plane strain in 2D."""
     mesh = grid(cell, 2, 0.15, inside=True)

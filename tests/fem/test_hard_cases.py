@@ -7,9 +7,9 @@ The names T1 to T23 are those of the cases in `benchmarks.stress`, which check a
 import math
 import warnings
 from functools import cache
+from itertools import cycle
 
 import pytest
-import torch
 
 from benchmarks.stress.fixtures import (
     UNDERCONSTRAINED,
@@ -86,11 +86,13 @@ def test_load_beyond_all_answers_is_refused_with_the_part_that_has_one(beam, pul
     solver = fem.Newton(problem, mixed_integration=mixed)
     for state in solver.iterate(as_load(force)):
         assert state.volume_ratio.item() > 0
+        assert state.residual.isfinite().all()
         assert not state.converged.any()
     assert state.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
     assert not state.stable.any()
     assert str(fem.Status(state.status.item())) == "no valid equilibrium"
-    assert state.residual.item() > solver.tol
+    residual = problem.relative_residual(state.displacement, force[None])
+    assert state.residual.item() == residual.item() > solver.tol
     assert 130 < q * state.load_factor.item() < q
     part = fem.evaluate_solution(
         problem, state.displacement, as_load(state.load_factor * force), solver.intermediate_tol
@@ -98,7 +100,7 @@ def test_load_beyond_all_answers_is_refused_with_the_part_that_has_one(beam, pul
     assert part.converged.all()
 
 
-@pytest.mark.parametrize("q", [1e-2, 1e-4, 1e-6, 1e-12])
+@pytest.mark.parametrize("q", [1e-2, 1e-12])
 def test_tiny_load_of_isotropic_laws_ends_at_the_linear_answer(
     beam, pull, corner, isotropic_law, q
 ):
@@ -114,7 +116,7 @@ def test_tiny_load_of_isotropic_laws_ends_at_the_linear_answer(
 
 
 @pytest.mark.parametrize("name", ["holzapfel_gasser_ogden", "holzapfel_ogden"])
-@pytest.mark.parametrize("q", [1e-2, 1e-6, 1e-12])
+@pytest.mark.parametrize("q", [1e-2, 1e-12])
 def test_tiny_load_of_fibres_without_compression_converges(beam, pull, laws, name, q):
     """Fibres that are shortened do not resist, so that the solution is not the linear one."""
     problem = beam(laws[name])
@@ -122,17 +124,6 @@ def test_tiny_load_of_fibres_without_compression_converges(beam, pull, laws, nam
     assert answer.status.item() == fem.Status.CONVERGED
     assert answer.iterations.item() <= 6
     assert answer.residual.item() < 1e-8
-
-
-def test_no_load_at_all_is_answered_by_rest(beam, any_law):
-    """Stress case T6: the zero load takes 0 iterations."""
-    problem = beam(any_law)
-    answer = fem.solve(
-        fem.Newton(problem), as_load(torch.zeros(problem.shape, dtype=torch.float64))
-    )
-    assert answer.status.item() == fem.Status.CONVERGED
-    assert answer.iterations.item() == 0
-    assert not answer.displacement.any()
 
 
 # Stress case T8: nu -> compliance over that of hex27 16 x 4 x 4
@@ -188,27 +179,6 @@ def test_mean_dilatation_does_not_lock(compliance, nu):
     assert 0.94 <= ratio <= 1.02
 
 
-@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
-@pytest.mark.parametrize("nu", [0.45, 0.499])
-def test_linear_elements_near_incompressibility_are_warned_of(grid, cell, nu):
-    """Stress case T8: with the remedies that the shape has."""
-    remedy = "set degree=2$" if cell in ("triangle", "tetra") else "or mean_dilatation=true$"
-    with pytest.warns(UserWarning, match=f"lock at Poisson's ratio {nu}: .*{remedy}"):
-        fem.Problem.build(grid(cell), fem.NeoHookeanLn(nu))
-
-
-@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
-def test_elements_that_do_not_lock_are_not_warned_of(grid, cell):
-    """Stress case T8."""
-    with warnings.catch_warnings(record=True) as seen:
-        warnings.simplefilter("always", UserWarning)
-        fem.Problem.build(grid(cell), fem.NeoHookeanLn(0.449))
-        fem.Problem.build(grid(cell), fem.NeoHookeanLn(0.4999), degree=2)
-        if cell in ("quad", "hexahedron"):
-            fem.Problem.build(grid(cell), fem.NeoHookeanLn(0.4999), mean_dilatation=True)
-    assert [str(one.message) for one in seen] == []
-
-
 # Stress case T10: cells along a side, through the thickness, degree -> w at a/h = 100 and 10
 PLATES = {
     (16, 1, 1): (0.087, 0.904),
@@ -234,39 +204,33 @@ def test_plate_bends_as_tabulated(cells, case):
     assert deflection(*cells, (100, 10)[case]) == pytest.approx(PLATES[cells][case], abs=6e-4)
 
 
-@pytest.mark.parametrize(("slenderness", "warned"), [(100, False), (330, True)])
-def test_flat_linear_cells_are_warned_of(slenderness, warned):
-    """Stress case T10: aspect ratio above 20; those of degree 2 are not."""
-    mesh = fem.box([1.0, 1.0, 1 / slenderness], [17, 17, 2])
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        fem.Problem.build(mesh, NH, degree=2)
-        fem.Problem.build(mesh, NH)
-    lines = [str(w.message) for w in caught if w.category is UserWarning]
-    expected = "linear hexahedral elements of aspect ratio 21 lock in bending: set degree=2"
-    assert lines == ([expected] if warned else [])
-
-
 SLIVERS = {1e-2: -0.2388289, 1e-4: -0.2386176, 1e-6: -0.2386155, 1e-8: -0.2386155}
 
 
-@pytest.mark.filterwarnings("ignore:.*rounding allows no less")
-@pytest.mark.parametrize("part", SLIVERS)
-@pytest.mark.parametrize("name", DIRECT)
-def test_slivers_are_warned_of_and_change_nothing(pull, name, mixed, part):
+@pytest.mark.parametrize(
+    ("part", "name", "mixed"),
+    [
+        (part, name, (row + column) % 2 == 0)
+        for row, part in enumerate(SLIVERS)
+        for column, name in enumerate(DIRECT)
+    ],
+)
+def test_slivers_are_warned_of_and_change_nothing(pull, part, name, mixed):
     """Stress case T11: the plane x = 50 of the beam moved to 37.5 + 12.5 eps."""
     with pytest.warns(UserWarning, match="aspect ratio .* lock in bending"):
         problem = fem.Problem.build(sliver_mesh(part), SVK, fixed=fem.Plane(0, "min"))
-    answer = fem.solve(
-        fem.Newton(problem, linear=name, mixed_integration=mixed), as_load(pull(problem, 20.0)[0])
-    )
+    solver = fem.Newton(problem, linear=name, mixed_integration=mixed)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        answer = fem.solve(solver, as_load(pull(problem, 20.0)[0]))
     assert answer.status.item() == fem.Status.CONVERGED
     assert answer.load_factor.item() == 1
     assert answer.iterations.item() <= 6
     end = answer.displacement[0, problem.points.sum(dim=1).argmax(), 2].item()
     assert end == pytest.approx(SLIVERS[part], abs=1.1e-7)
-    if part == 1e-8:  # rounding leaves more than the tolerance, and that is said
-        assert 1e-8 < answer.residual.item() < 1e-5
+    # rounding leaves more than the tolerance for the thinnest, and that is said
+    said = any("rounding allows no less" in str(one.message) for one in caught)
+    assert said == (1e-8 < answer.residual.item() < 1e-5) == (part == 1e-8)
 
 
 def test_body_folded_at_rest_is_refused_by_the_numbers_of_its_cells():
@@ -284,8 +248,11 @@ def test_loose_body_is_refused_by_its_motions(support):
     assert "factor" not in linear.__dict__
 
 
-@pytest.mark.parametrize("support", UNDERCONSTRAINED)
-@pytest.mark.parametrize("name", fem.installed_backends())
+@pytest.mark.parametrize(
+    ("support", "name"),
+    [(support, "superlu") for support in UNDERCONSTRAINED]
+    + list(zip(cycle(UNDERCONSTRAINED), fem.installed_backends())),
+)
 def test_loose_body_never_moves_far(support, name):
     """Stress case T13: Newton does not take the rounding of a zero pivot for an answer."""
     problem = underconstrained_bar(support)
@@ -305,8 +272,8 @@ def test_region_without_a_node_is_an_error_and_not_an_absent_load(grid, use, whe
         REGION_USES[use](grid("hexahedron"), region)
 
 
-@pytest.mark.parametrize("name", DIRECT)
-def test_column_beyond_buckling_is_in_balance_and_flagged(mixed, name):
+@pytest.mark.parametrize(("name", "mixed"), list(zip(DIRECT, cycle([False, True]))))
+def test_column_beyond_buckling_is_in_balance_and_flagged(name, mixed):
     """Stress cases T17 and T22: two negative pivots, whichever backend meets them; not stored."""
     problem, force = column(fem.SaintVenantKirchhoff(0.0), (10, 1, 1))
     answer = fem.solve(
@@ -321,8 +288,11 @@ def test_column_beyond_buckling_is_in_balance_and_flagged(mixed, name):
     assert answer.displacement[..., 1:].abs().max() < 1e-12
 
 
-@pytest.mark.parametrize("P", [2.0397, 2.039763, 2.0398, 2.5])
-@pytest.mark.parametrize("name", fem.installed_backends())
+@pytest.mark.parametrize(
+    ("name", "P"),
+    [("superlu", P) for P in (2.0397, 2.0398, 2.5)]
+    + [(name, 2.039763) for name in fem.installed_backends()],
+)
 def test_singular_tangent_ends_in_words_and_not_in_nan(name, P):
     """Stress case T22: at the critical load 2.039763 and about it, with any backend."""
     problem, force = column(fem.SaintVenantKirchhoff(0.0), (10, 1, 1))

@@ -144,13 +144,6 @@ def residual(pattern: Pattern, values: np.ndarray, x: np.ndarray, right: np.ndar
     return float(np.linalg.norm(rest) / np.linalg.norm(right))
 
 
-def test_positive_definite_matrix_is_solved_to_rounding(name, stiffness):
-    pattern, values = stiffness
-    solver = make_backend(pattern, name)
-    assert error(solver, pattern, values) < 1e-10
-    assert solver.factorise(values).negative_pivots == (None if name == "cg" else 0)
-
-
 def test_many_right_hand_sides_are_solved_like_one(name, stiffness):
     pattern, values = stiffness
     factor = make_backend(pattern, name).factorise(values)
@@ -201,12 +194,14 @@ def test_indefinite_matrix_is_solved_and_its_negative_eigenvalues_are_counted(di
     assert eigenvalues[2] - eigenvalues[1] > 1e-3 * eigenvalues[2]  # count = 2 has run
 
 
-def test_backend_solves_one_matrix_after_another(name, stiffness):
-    """Only the symbolic work is shared."""
+def test_positive_definite_matrices_are_solved_to_rounding(name, stiffness):
+    """One after another: only the symbolic work is shared."""
     pattern, values = stiffness
     solver = make_backend(pattern, name)
     for scale in (1.0, 1e-6, 1e6):
         assert error(solver, pattern, scale * values) < 1e-10
+        factor = solver.factorise(scale * values)
+        assert factor.negative_pivots == (None if name == "cg" else 0)
 
 
 def test_factor_stays_valid_after_the_next_factorisation(name, stiffness):
@@ -248,14 +243,9 @@ def test_right_hand_side_may_have_strides(name, stiffness):
     pattern, values = stiffness
     many = np.random.default_rng(0).standard_normal((pattern.size, 3))
     factor = make_backend(pattern, name).factorise(values)
-    for right in (*many.T, many[::-1, 0]):
+    for right in (many[:, 1], many[::-1, 0]):
         expected = factor.solve(right.copy())
         assert factor.solve(right) == pytest.approx(expected, rel=1e-9)
-
-
-def test_zero_right_hand_side_has_the_solution_zero(name, stiffness):
-    pattern, values = stiffness
-    assert not make_backend(pattern, name).factorise(values).solve(np.zeros(pattern.size)).any()
 
 
 @pytest.mark.parametrize("entry", [np.nan, np.inf])
@@ -276,17 +266,17 @@ SINGULAR = {
 
 
 @pytest.mark.parametrize("kind", SINGULAR)
-def test_singular_matrix_is_an_error(direct, kind):
+def test_singular_matrix_is_an_error(name, kind):
+    """Conjugate gradients find it when they solve."""
     pattern, values = dense(SINGULAR[kind])
-    with pytest.raises(SingularMatrix):
-        make_backend(pattern, direct).factorise(values)
 
+    def attempt() -> None:
+        factor = make_backend(pattern, name).factorise(values)
+        if name == "cg":
+            factor.solve(np.ones(6))
 
-@pytest.mark.parametrize("kind", SINGULAR)
-def test_singular_matrix_is_an_error_of_conjugate_gradients_when_it_is_solved(kind):
-    pattern, values = dense(SINGULAR[kind])
     with pytest.raises(SingularMatrix):
-        make_backend(pattern, "cg").factorise(values).solve(np.ones(6))
+        attempt()
 
 
 def test_backend_works_after_a_matrix_that_it_refused(name, stiffness):
@@ -372,7 +362,7 @@ def test_applied_factor_is_a_fixed_linear_map(name, body, stiffness):
     assert not factor.apply(np.zeros(pattern.size)).any()
 
 
-@pytest.mark.parametrize("size", [1e-300, 1e-40, 1e40, 1e100])
+@pytest.mark.parametrize("size", [1e-300, 1e100])
 def test_applied_factor_does_not_depend_on_the_size_of_the_right_hand_side(name, body, size):
     pattern, values = system(body)
     factor = make_backend(pattern, name, motions(body)).factorise(values)
@@ -438,16 +428,6 @@ def test_narrow_numbering_is_kept(stiffness):
     layout = band_storage(pattern)
     assert layout.order is None
     assert layout.half == 3 * (9 + 3 + 1) + 2  # a node's farthest neighbour, its last component
-
-
-def test_float32_factor_solves_to_float64_accuracy(stiffness):
-    pattern, values = stiffness
-    factor = make_backend(pattern, "band32").factorise(values)
-    answer = np.random.default_rng(0).normal(size=pattern.size)
-    found = factor.solve(full_matrix(pattern, values) @ answer)
-    assert isinstance(factor, MixedPrecisionFactor)
-    assert factor.exact is None
-    assert np.linalg.norm(found - answer) < 1e-10 * np.linalg.norm(answer)
 
 
 def test_float32_covers_stiff_and_soft_unknowns(stiffness):
@@ -651,17 +631,17 @@ def test_superlu_replaces_pardiso_where_that_is_not_installed(hide, stiffness):
     assert factor.negative_pivots > 0
 
 
-def test_error_names_the_package_of_a_backend_that_is_not_installed(hide, stiffness):
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("pardiso", r"not installed: pip install .*\[pardiso\]"),
+        ("umfpack", r"linear = 'umfpack' must be one of auto, band, band32, pardiso"),
+    ],
+)
+def test_a_backend_that_cannot_be_had_is_refused_by_name(hide, stiffness, name, message):
     hide("pypardiso")
-    with pytest.raises(ValueError, match=r"not installed: pip install .*\[pardiso\]"):
-        make_backend(stiffness[0], "pardiso")
-
-
-def test_error_lists_the_backends_for_an_unknown_one(stiffness):
-    with pytest.raises(
-        ValueError, match=r"linear = 'umfpack' must be one of auto, band, band32, pardiso"
-    ):
-        make_backend(stiffness[0], "umfpack")
+    with pytest.raises(ValueError, match=message):
+        make_backend(stiffness[0], name)
 
 
 def test_full_matrix_mirrors_the_upper_triangle(stiffness):

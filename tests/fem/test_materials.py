@@ -106,16 +106,6 @@ UNIAXIAL = {  # lateral stretch and P11 at each of STRETCHES, by an independent 
         (0.78310418, 0.83342554),
     ],
 }
-CAUCHY = {  # sigma11 at a stretch of 1.5
-    "saint_venant_kirchhoff": 1.5,
-    "neo_hookean_ln": 0.48828786,
-    "neo_hookean_iso_k2": 0.432703,
-    "neo_hookean_iso_k4": 0.42404003,
-    "stable_neo_hookean": 0.53794213,
-    "mooney_rivlin_k2": 0.49363748,
-    "yeoh_k2": 0.49233813,
-    "ogden_k2": 0.59340287,
-}
 BIAXIAL = {  # thickness and P11 at a stretch of 0.8 and of 1.3
     "saint_venant_kirchhoff": [(1.1439281, -0.20571429), (0.63919592, 0.64071429)],
     "neo_hookean_ln": [(1.187912, -0.37073795), (0.77345679, 0.32300727)],
@@ -251,16 +241,9 @@ def test_uniaxial_tension_has_the_tabulated_lateral_stretch_and_stress(laws, nam
         assert axial == digits(stress)
 
 
-@pytest.mark.parametrize("name", CAUCHY)
-def test_cauchy_stress_of_uniaxial_tension_is_tabulated(laws, name):
-    """The stress is sigma11 = P11 / lateral^2 at a stretch of 1.5."""
-    lateral = UNIAXIAL[name][STRETCHES.index(1.5)][0]
-    side, axial = uniaxial(laws[name], 1.5, 0.8 * lateral, 1.2 * lateral)
-    assert axial / side**2 == digits(CAUCHY[name])
-
-
-@pytest.mark.parametrize("stretch", [0.7, 0.9, 1.1, 1.5])
-@pytest.mark.parametrize("poisson", [0.0, 0.1, 0.3, 0.49])
+@pytest.mark.parametrize(
+    ("poisson", "stretch"), [(0.0, 0.7), (0.1, 0.9), (0.3, 0.7), (0.3, 1.1), (0.49, 1.5)]
+)
 def test_uniaxial_tension_follows_the_closed_form(poisson, stretch):
     """The tolerance is 1e-8."""
     side, axial = uniaxial(fem.SaintVenantKirchhoff(poisson), stretch)
@@ -366,16 +349,6 @@ def test_tangent_is_the_curvature_of_the_energy(law, gradients):
     assert_close(law.tangent(gradients), expected, rtol=1e-9, atol=1e-11)
 
 
-def test_differences_of_stress_follow_the_tangent(law, gradients):
-    """Central differences use h = 1e-6 to 1e-9, independent of autodiff."""
-    direction = gradients.flip(0)
-    slope = (
-        law.stress(gradients + 1e-6 * direction) - law.stress(gradients - 1e-6 * direction)
-    ) / 2e-6
-    product = torch.einsum("nijkl,nkl->nij", law.tangent(gradients), direction)
-    assert_close(product, slope, rtol=1e-8, atol=1e-9)
-
-
 @pytest.mark.usefixtures("without_fibres")
 @pytest.mark.parametrize(
     "stretches",
@@ -401,17 +374,6 @@ def test_stress_can_be_differentiated_at_rest(law, gradients):
     hooke = torch.einsum("ijkl,kl->ij", law.tangent(rest), v)
     assert_close(along, hooke, rtol=1e-12, atol=1e-14)
     assert_close((back * v).sum(), (hooke * w).sum(), rtol=1e-12, atol=1e-14)
-
-
-def test_tangent_is_symmetric(law, gradients):
-    A = law.tangent(gradients)
-    assert_close(A, A.permute(0, 3, 4, 1, 2), rtol=1e-13, atol=1e-13)
-
-
-def test_batch_shape_does_not_matter(law, gradients):
-    folded = gradients.reshape(2, 5, 2, 3, 3)
-    for method in (law.energy, law.stress, law.tangent, EnergyAlone(law).stress):
-        assert_close(method(folded).flatten(0, 2), method(gradients), rtol=1e-14, atol=1e-14)
 
 
 def test_rotated_body_feels_the_rotated_stress(finite, gradients, rotation):
@@ -477,15 +439,6 @@ def test_moduli_at_rest_are_those_of_the_tangent(law):
     assert law.poisson_ratio == pytest.approx(ratio, rel=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("name", "shear"), [("mooney_rivlin_k2", 0.4), ("yeoh_k2", 0.4), ("ogden_k2", 0.42)]
-)
-def test_rubbers_have_their_shear_and_bulk_modulus_at_rest(laws, name, shear):
-    """The moduli are 2 (C10 + C01), 2 C10, sum of mu_i; kappa = 2."""
-    assert laws[name].mu == pytest.approx(shear, rel=1e-14)
-    assert laws[name].lam + 2 / 3 * shear == pytest.approx(2.0, rel=1e-14)
-
-
 @pytest.mark.usefixtures("without_fibres")
 @pytest.mark.parametrize("size", [1e-10, 1e-14])
 def test_tiny_gradients_keep_the_digits_of_hooke(law, gradients, size):
@@ -528,83 +481,6 @@ def test_yeoh_of_one_term_is_mooney_rivlin_without_its_second(gradients):
     yeoh, mooney = fem.YeohK2(0.2, 0.0, 0.0, 2.0), fem.MooneyRivlinK2(0.2, 0.0, 2.0)
     assert_close(yeoh.stress(gradients), mooney.stress(gradients), rtol=1e-13, atol=1e-15)
     assert_close(yeoh.tangent(gradients), mooney.tangent(gradients), rtol=1e-13, atol=1e-15)
-
-
-@pytest.fixture
-def isotropic(law) -> fem.InvariantBasedMaterial:
-    """Each law that is given by slopes of its own."""
-    if not isinstance(law, fem.InvariantBasedMaterial) or not law.finite:
-        pytest.skip("has no slopes of its own")
-    return law
-
-
-def slopes_at(law: fem.InvariantBasedMaterial, logs: Tensor) -> tuple[Tensor, ...]:
-    """Return I1, all slopes and the three squared stretches at log stretches (..., 3)."""
-    squares = (2 * logs).exp()
-    I1, log_J = squares.sum(-1), logs.sum(-1)
-    I2 = (I1**2 - (squares**2).sum(-1)) / 2
-    m1 = torch.expm1(-2 / 3 * log_J)
-    found = law.invariant_derivatives(law.constants, I1 - 3, I2 - 3, torch.expm1(log_J), log_J, m1)
-    return I1, squares, *(s + torch.zeros_like(I1) for s in found)
-
-
-@pytest.fixture
-def logs() -> Tensor:
-    """Principal log stretches far from rest."""
-    random = torch.Generator().manual_seed(4)
-    return torch.rand(10, 3, generator=random, dtype=torch.float64) * 0.8 - 0.4
-
-
-def stretched(law: fem.Material, logs: Tensor) -> Tensor:
-    """Return the energy at log stretches (..., 3)."""
-    return law.energy(torch.diag_embed(torch.expm1(logs)))
-
-
-def test_first_slopes_are_those_of_the_energy_over_the_invariants(isotropic, logs):
-    I1, squares, rest, W2, p, *_ = slopes_at(isotropic, logs)
-    W1 = (rest - p - 4 * W2) / 2
-    slope = torch.func.vmap(torch.func.grad(lambda x: stretched(isotropic, x)))(logs)
-    chained = W1[:, None] * 2 * squares + p[:, None]
-    chained = chained + W2[:, None] * 2 * squares * (I1[:, None] - squares)
-    assert_close(chained, slope, rtol=1e-10, atol=1e-12)
-
-
-def test_second_slopes_are_those_of_the_energy_over_the_invariants(isotropic, logs):
-    I1, squares, rest, W2, p, W11, W12, W22, W1J, W2J, pJ = (
-        s[:, None, None] if s.ndim == 1 else s for s in slopes_at(isotropic, logs)
-    )
-    W1 = (rest - p - 4 * W2) / 2
-    A = 2 * squares
-    B = A * (I1[:, :, 0] - squares)
-    one = torch.ones_like(A)
-
-    def dyads(X, Y):
-        return X[:, :, None] * Y[:, None, :]
-
-    def both(X, Y):
-        return dyads(X, Y) + dyads(Y, X)
-
-    chained = W11 * dyads(A, A) + W12 * both(A, B) + W22 * dyads(B, B)
-    chained = chained + W1J * both(A, one) + W2J * both(B, one) + pJ * dyads(one, one)
-    chained = chained + W1 * torch.diag_embed(2 * A)
-    chained = chained + W2 * (torch.diag_embed(2 * B - A * A) + dyads(A, A))
-    curvature = torch.func.vmap(torch.func.hessian(lambda x: stretched(isotropic, x)))(logs)
-    assert_close(chained, curvature, rtol=1e-9, atol=1e-11)
-
-
-def test_slopes_at_rest_are_those_of_a_body_without_stress(isotropic):
-    """The sum that is zero at rest is so to the last bit."""
-    rest = isotropic.invariant_derivatives(isotropic.constants, 0.0, 0.0, 0.0, 0.0, 0.0)[0]
-    assert rest == 0
-
-
-def test_slopes_say_the_same_of_numbers_and_tensors(isotropic, logs):
-    """They are the one source of the tensor path and of compiled code."""
-    _, _, *batch = slopes_at(isotropic, logs)
-    for k, one in enumerate(logs):
-        _, _, *numbers = slopes_at(isotropic, one)
-        for several, single in zip(batch, numbers, strict=True):
-            assert_close(several[k], single, rtol=1e-15, atol=0)
 
 
 def test_saint_venant_softens_below_its_limit_stretch():

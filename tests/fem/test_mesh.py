@@ -25,6 +25,9 @@ from dpl import fem
 from dpl.fem.mesh import check_mesh, nodes_in
 from dpl.fem.mesh.generators import aspect_ratio, longest_side
 
+# what the process of a reader adds is in test_mesh_sandbox
+pytestmark = pytest.mark.usefixtures("in_process")
+
 
 def volumes(mesh: skfem.Mesh) -> np.ndarray:
     """Return the volumes of the cells."""
@@ -63,35 +66,6 @@ def test_node_numbers_of_a_grid_have_a_small_bandwidth(grid, size, nodes, cell, 
 @pytest.mark.parametrize("order", [(9, 3, 2), (2, 9, 3), (3, 2, 9)])
 def test_bandwidth_of_a_box_does_not_depend_on_the_direction_of_its_long_side(order):
     assert np.ptp(fem.box([1.0, 1.0, 1.0], order).t, axis=0).max() == 2 * 3 + 2 + 1
-
-
-@pytest.mark.parametrize(
-    ("size", "nodes", "cell", "message"),
-    [
-        ([1, 1], [2, 2, 2], "hexahedron", "size"),
-        ([1, 1, 0], [2, 2, 2], "hexahedron", "size"),
-        ([1, 1, -1], [2, 2, 2], "tetra", "size"),
-        ([1, 1, math.nan], [2, 2, 2], "hexahedron", "size"),
-        ([1, 1, math.inf], [2, 2, 2], "hexahedron", "size"),
-        ([1, 1, 1], [2, 2], "hexahedron", "nodes"),
-        ([1, 1, 1], [2, 2, 1], "hexahedron", "nodes"),
-        ([1, 1, 1], [2, 2, 2.5], "hexahedron", "nodes"),
-        ([1, 1, 1], [2, 2, 2], "quad", "cell"),
-        ([1, 1, 5e-324], [2, 2, 2], "hexahedron", "size"),
-        ([1, 1, 1e300], [2, 2, 2], "hexahedron", "size"),
-        ([1, 1, 2e6], [2, 2, 2], "hexahedron", "must have a ratio of at most 1e.06"),
-    ],
-)
-def test_box_out_of_range_is_an_error(size, nodes, cell, message):
-    with pytest.raises(ValueError, match=message):
-        fem.box(size, nodes, cell)
-
-
-def test_rectangle_out_of_range_is_an_error():
-    with pytest.raises(ValueError, match="size"):
-        fem.rectangle([1, 1, 1], [2, 2])
-    with pytest.raises(ValueError, match="cell"):
-        fem.rectangle([1, 1], [2, 2], "hexahedron")
 
 
 def test_more_nodes_than_fit_are_refused_before_they_are_made(monkeypatch):
@@ -158,12 +132,6 @@ def test_finger_has_a_closed_chamber_within_its_walls():
     assert float(problem.force_at_rest.sum(dim=0).abs().max()) < 1e-12, "it is closed"
 
 
-@pytest.mark.parametrize("cells", [[2, 4, 4], [8, 2, 4], [8, 4, 5], [8, 4], [8, 4, 2]])
-def test_finger_without_walls_is_an_error_of_one_line(cells):
-    with pytest.raises(ValueError, match=r"cells = .* must be at least \[3, 3, 4\]"):
-        fem.finger(cells=cells)
-
-
 def test_propeller_has_the_size_of_the_papers():
     """4,025 nodes, 12,075 degrees of freedom; a metre long; fixed at 525 of them."""
     mesh = fem.propeller()
@@ -226,33 +194,61 @@ def test_node_numbers_of_the_propeller_have_a_small_bandwidth():
     assert np.ptp(fem.propeller().t, axis=0).max() < 250
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"diameter": -1.0}, "diameter = -1.0"),
-        ({"diameter": math.nan}, "diameter = nan"),
-        ({"hub_diameter": 1.0}, "hub_diameter = 1.0 must be less than diameter"),
-        ({"bore_diameter": 0.2}, "bore_diameter = 0.2 must be less than hub_diameter"),
-        ({"bore_diameter": 0.0}, "bore_diameter = 0.0"),
-        ({"hub_length": math.inf}, "hub_length = inf"),
-        ({"blades": 1}, "blades = 1"),
-        ({"blades": 2.5}, "blades = 2.5"),
-        ({"pitch_angle": [60.0]}, "pitch_angle"),
-        ({"pitch_angle": [60.0, 90.0]}, "pitch_angle"),
-        ({"pitch_angle": [math.nan, 20.0]}, "pitch_angle"),
-        ({"chord": [0.2, 0.0]}, "chord"),
-        ({"chord": [0.02, 0.02]}, "chord or thickness fold the blades"),
-        ({"thickness": [0.05]}, "thickness"),
-        ({"thickness": [0.2, 0.01]}, "no room between 5 blades"),
-        ({"blades": 20}, "no room between 20 blades"),
-        ({"cells": [3, 2, 2, 6]}, "cells"),
-        ({"cells": [3, 2, 2, 6, 0]}, "cells"),
-        ({"cells": [3, 2, 2, 6, 2.5]}, "cells"),
-    ],
-)
-def test_propeller_out_of_range_is_an_error_of_one_line(options, message):
+INVALID = [  # generator, its options, words of the message
+    *(
+        (fem.box, {"size": size, "nodes": nodes, "cell": cell}, message)
+        for size, nodes, cell, message in (
+            ([1, 1], [2, 2, 2], "hexahedron", "size"),
+            ([1, 1, 0], [2, 2, 2], "hexahedron", "size"),
+            ([1, 1, -1], [2, 2, 2], "tetra", "size"),
+            ([1, 1, math.nan], [2, 2, 2], "hexahedron", "size"),
+            ([1, 1, math.inf], [2, 2, 2], "hexahedron", "size"),
+            ([1, 1, 1], [2, 2], "hexahedron", "nodes"),
+            ([1, 1, 1], [2, 2, 1], "hexahedron", "nodes"),
+            ([1, 1, 1], [2, 2, 2.5], "hexahedron", "nodes"),
+            ([1, 1, 1], [2, 2, 2], "quad", "cell"),
+            ([1, 1, 5e-324], [2, 2, 2], "hexahedron", "size"),
+            ([1, 1, 1e300], [2, 2, 2], "hexahedron", "size"),
+            ([1, 1, 2e6], [2, 2, 2], "hexahedron", "must have a ratio of at most 1e.06"),
+        )
+    ),
+    (fem.rectangle, {"size": [1, 1, 1], "nodes": [2, 2]}, "size"),
+    (fem.rectangle, {"size": [1, 1], "nodes": [2, 2], "cell": "hexahedron"}, "cell"),
+    *(
+        (fem.finger, {"cells": cells}, r"cells = .* must be at least \[3, 3, 4\]")
+        for cells in ([2, 4, 4], [8, 2, 4], [8, 4, 5], [8, 4], [8, 4, 2])
+    ),
+    *(
+        (fem.propeller, options, message)
+        for options, message in (
+            ({"diameter": -1.0}, "diameter = -1.0"),
+            ({"diameter": math.nan}, "diameter = nan"),
+            ({"hub_diameter": 1.0}, "hub_diameter = 1.0 must be less than diameter"),
+            ({"bore_diameter": 0.2}, "bore_diameter = 0.2 must be less than hub_diameter"),
+            ({"bore_diameter": 0.0}, "bore_diameter = 0.0"),
+            ({"hub_length": math.inf}, "hub_length = inf"),
+            ({"blades": 1}, "blades = 1"),
+            ({"blades": 2.5}, "blades = 2.5"),
+            ({"pitch_angle": [60.0]}, "pitch_angle"),
+            ({"pitch_angle": [60.0, 90.0]}, "pitch_angle"),
+            ({"pitch_angle": [math.nan, 20.0]}, "pitch_angle"),
+            ({"chord": [0.2, 0.0]}, "chord"),
+            ({"chord": [0.02, 0.02]}, "chord or thickness fold the blades"),
+            ({"thickness": [0.05]}, "thickness"),
+            ({"thickness": [0.2, 0.01]}, "no room between 5 blades"),
+            ({"blades": 20}, "no room between 20 blades"),
+            ({"cells": [3, 2, 2, 6]}, "cells"),
+            ({"cells": [3, 2, 2, 6, 0]}, "cells"),
+            ({"cells": [3, 2, 2, 6, 2.5]}, "cells"),
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize(("generator", "options", "message"), INVALID)
+def test_generator_out_of_range_is_an_error_of_one_line(generator, options, message):
     with pytest.raises(ValueError, match=message) as error:
-        fem.propeller(**options)
+        generator(**options)
     assert "\n" not in str(error.value)
 
 
@@ -509,7 +505,7 @@ def warped(mesh: skfem.Mesh, size: float) -> skfem.Mesh:
 
 @pytest.mark.parametrize("warp", [0.0, 0.2])
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
-@pytest.mark.parametrize(("coarse", "fine"), [(1, 2), (2, 3), (1, 4)])
+@pytest.mark.parametrize(("coarse", "fine"), [(2, 3), (1, 4)])
 def test_fine_cells_on_coarse_ones_are_an_error(cell, warp, coarse, fine):
     """All nodes that the other side lacks hang; on a warped plane tetrahedra have edges there."""
     grid, dim = (fem.rectangle, 2) if cell in ("quad", "triangle") else (fem.box, 3)
@@ -534,8 +530,7 @@ def test_sides_cut_along_the_other_diagonal_are_an_error():
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
-@pytest.mark.parametrize("thin", [1e-2, 1e-4, 1e-6, 1e-8])
-@pytest.mark.parametrize("at", [50.0, 87.5])
+@pytest.mark.parametrize(("thin", "at"), [(1e-2, 50.0), (1e-8, 50.0), (1e-8, 87.5)])
 def test_a_layer_of_slivers_is_valid(cell, thin, at):
     """Inside of the beam and at its end."""
     mesh = fem.box([100.0, 25.0, 25.0], [9, 3, 3], cell)
@@ -554,7 +549,7 @@ def test_distorted_thin_and_distant_meshes_are_valid(cell, grid):
         assert check_mesh(moved) is moved
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("cell", ["tetra", "triangle"])
 def test_folded_simplices_are_an_error(cell, seed, grid):
     """The volume that the boundary encloses is the flux of x / D through it."""
@@ -577,10 +572,9 @@ def test_a_mesh_built_by_hand_may_not_have_nodes_without_a_cell():
         check_mesh(skfem.MeshHex(np.concatenate([[[9], [9], [9]], mesh.p], axis=1), mesh.t + 1))
 
 
-@pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
-def test_a_hundred_thousand_nodes_can_be_checked(cell):
+def test_a_hundred_thousand_nodes_can_be_checked():
     """A comparison of all pairs would not end."""
-    mesh = fem.box([1.0, 1.0, 1.0], [47, 47, 47], cell)
+    mesh = fem.box([1.0, 1.0, 1.0], [47, 47, 47])
     assert check_mesh(mesh) is mesh
 
 

@@ -12,7 +12,6 @@ import torch
 from torch.testing import assert_close
 
 from dpl import fem
-from dpl.fem.linear import full_matrix
 from dpl.fem.loads import constant, log_tail_mixture, logarithmic, modal_basis, normal, uniform01
 from dpl.fem.loads.sampling import SAMPLINGS
 
@@ -41,12 +40,14 @@ def sampling(request):
     return request.param
 
 
-def stiffness(problem):
-    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    return full_matrix(problem.pattern, problem.tangent(rest)[0].numpy())
-
-
-@pytest.mark.parametrize("cells", REFERENCE, ids=lambda cells: f"{cells[0]}x{cells[1]}x{cells[1]}")
+@pytest.mark.parametrize(
+    ("law", "cells"),
+    [
+        (fem.NeoHookeanLn(0.3), (8, 2)),
+        (fem.SaintVenantKirchhoff(0.3), (8, 2)),
+        (fem.NeoHookeanLn(0.3), (16, 4)),
+    ],
+)
 def test_eigenvalues_are_those_of_an_independent_code(beam, law, cells):
     expected = REFERENCE[cells]
     found = fem.eigenmodes(
@@ -61,23 +62,12 @@ def test_tetrahedra_split_the_pair(beam):
     assert found == pytest.approx([30.27082, 41.36540], rel=1e-6)
 
 
-def test_modes_are_the_lowest_eigenvectors_orthonormal_and_zero_where_the_body_is_held(linear):
-    problem, modes = linear.problem, fem.eigenmodes(linear, 7)
-    vectors, K = modes.vectors[problem.free].numpy(), stiffness(problem)
-    assert vectors.T @ vectors == pytest.approx(np.eye(vectors.shape[1]), abs=1e-10)
-    assert np.abs(K @ vectors - vectors * modes.values.numpy()).max() < 1e-10
-    every = np.linalg.eigvalsh(K.toarray())
-    assert modes.values.numpy() == pytest.approx(every[: len(modes.values)], rel=1e-9)
-    assert (np.diff(modes.values.numpy()) > -1e-12).all()
-    assert not modes.vectors[~problem.free].any()
-
-
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
 def test_modes_do_not_depend_on_the_start_of_the_iteration(beam, monkeypatch, cell):
     problem = beam(fem.NeoHookeanLn(0.3), 8, 2, cell=cell)
     first = fem.eigenmodes(fem.LinearSolver(problem, linear="superlu"), 5)
     original = scipy.sparse.linalg.eigsh
-    for seed in (1, 2, 3):
+    for seed in (1, 2):
 
         def restarted(matrix, count, *, v0, seed=seed, **options):
             start = np.random.default_rng(seed).uniform(-1, 1, len(v0))
@@ -110,7 +100,7 @@ def test_a_family_of_modes_is_kept_whole(linear, requested, given):
     assert len(fem.eigenmodes(linear, requested).values) == given
 
 
-def test_neighbouring_eigenvalues_are_one_family(monkeypatch):
+def test_neighbouring_eigenvalues_are_one_family():
     """A bar of nearly square section: its two bending planes differ by 2 %, both are excited."""
     mesh = fem.box([4.0, 1.0, 1.01], [9, 3, 3])
     problem = fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), fixed=HELD)
@@ -119,9 +109,9 @@ def test_neighbouring_eigenvalues_are_one_family(monkeypatch):
     assert 1e-3 < float(modes.values[1] / modes.values[0] - 1) < 0.05
 
 
-def test_small_loads_along_a_mode_move_the_body_along_it(beam, law):
+def test_small_loads_along_a_mode_move_the_body_along_it(beam):
     """F = q phi_k gives q phi_k / lambda_k, but for a deviation that is linear in q."""
-    problem = beam(law)
+    problem = beam(fem.NeoHookeanLn(0.3))
     newton = fem.Newton(problem, tol=1e-10, linear="superlu")
     modes = fem.eigenmodes(newton.linear_solver, 3)
     for k, value in enumerate(modes.values):
@@ -271,11 +261,6 @@ def test_modal_loads_are_uniform_up_to_their_largest(linear, sampling):
     assert abs(np.corrcoef(share.T)[0, 1]) < 0.2
 
 
-def test_radii_and_centres_vary(loads):
-    counts = {int(force.any(dim=1).sum()) for force in loads.sample((0, 0), range(30)).force}
-    assert len(counts) > 10
-
-
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_other_distributions_can_be_plugged_in(linear, share):
     draw = partial(np.full_like, fill_value=share)
@@ -406,15 +391,6 @@ def test_sobol_loads_cover_what_few_independent_ones_leave_out(linear):
     assert spread["independent"] <= 27
 
 
-def test_plane_bodies_have_modal_loads_too():
-    mesh = fem.rectangle([4.0, 1.0], [9, 3])
-    problem = fem.Problem.build(mesh, fem.SaintVenantKirchhoff(0.3), fixed=HELD)
-    newton = fem.Newton(problem, linear="superlu")
-    loads = fem.ModalLoads(newton.linear_solver, n_modes=3)
-    answer = fem.solve(newton, loads.sample((0, 0), range(3)))
-    assert answer.converged.all()
-
-
 @pytest.mark.parametrize(
     ("options", "named"),
     [
@@ -465,14 +441,6 @@ def test_a_number_of_modes_that_the_body_does_not_have_is_refused(beam, count):
         fem.eigenmodes(fem.LinearSolver(problem, linear="superlu"), count)
 
 
-def test_a_loose_body_is_refused_before_anything_is_factorised(monkeypatch):
-    problem = fem.Problem.build(fem.box([1.0, 1.0, 1.0], [4, 4, 4]), fem.NeoHookeanLn(0.3))
-    linear = fem.LinearSolver(problem, linear="superlu")
-    with pytest.raises(ValueError, match="6 rigid modes are unconstrained"):
-        fem.eigenmodes(linear, 3)
-    assert "factor" not in linear.__dict__
-
-
 def test_selected_modes_are_those_of_their_numbers(linear):
     every, chosen = fem.ModalLoads(linear, n_modes=5), fem.ModalLoads(linear, modes=[0, 3, 4])
     expected = every.eigenmodes
@@ -491,12 +459,6 @@ def test_one_mode_of_a_pair_with_equal_eigenvalues_can_be_selected(linear):
     assert (mean[0, 1] > 0) & (mean[1, 2] > 0)
     assert torch.allclose(mean[0, [0, 2]], torch.zeros(2).double(), atol=1e-8)
     assert torch.allclose(mean[1, :2], torch.zeros(2).double(), atol=1e-8)
-
-
-def test_the_softest_selected_mode_has_the_deflection(linear):
-    loads = fem.ModalLoads(linear, modes=[2, 4], deflection=0.1)
-    moved = linear.solve(loads.q_max[0] * loads.eigenmodes.vectors[..., 0])
-    assert float(moved.norm(dim=1).max()) == pytest.approx(0.1, rel=1e-8)
 
 
 def test_forces_of_selected_modes_are_recognised(linear):

@@ -2,13 +2,10 @@
 
 import math
 import pickle
-import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 
-import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
@@ -44,46 +41,50 @@ def mixed(request) -> bool:
     return request.param
 
 
-# The paper's beam: law, cells, cell, degree, q [Pa], u_z, u_x of the corner [m], iterations
+# The paper's beam: law, cells, degree, q [Pa], u_z, u_x of the corner [m], iterations
 BEAMS = [
-    (SVK, (4, 1), "hexahedron", 1, 5, -4.74016, None, None),
-    (SVK, (4, 1), "hexahedron", 1, 20, -18.7537, None, None),
-    (SVK, (4, 1), "hexahedron", 1, 40, -35.36415, None, None),
-    (NH, (4, 1), "hexahedron", 1, 40, -35.3999, None, None),
-    (SVK, (8, 2), "hexahedron", 1, 5, -6.3661, None, 4),
-    (SVK, (8, 2), "hexahedron", 1, 20, -24.79226, None, 6),
-    (SVK, (8, 2), "hexahedron", 1, 40, -44.77862, None, 7),
-    (NH, (8, 2), "hexahedron", 1, 40, -44.71446, None, 8),
-    (SVK, (16, 4), "hexahedron", 1, 5, -7.06306, None, 4),
-    (SVK, (16, 4), "hexahedron", 1, 20, -27.28787, None, 6),
-    (SVK, (16, 4), "hexahedron", 1, 40, -48.38715, None, 7),
-    (NH, (16, 4), "hexahedron", 1, 40, -48.34221, None, 7),
-    (SVK, (4, 1), "hexahedron", 2, 5, -7.20015, None, None),
-    (SVK, (4, 1), "hexahedron", 2, 20, -27.72827, None, None),
-    (SVK, (4, 1), "hexahedron", 2, 40, -48.8317, None, None),
-    (NH, (4, 1), "hexahedron", 2, 40, -48.76971, None, None),
+    (SVK, (4, 1), 1, 5, -4.74016, None, None),
+    (SVK, (4, 1), 1, 20, -18.7537, None, None),
+    (SVK, (4, 1), 1, 40, -35.36415, None, None),
+    (NH, (4, 1), 1, 40, -35.3999, None, None),
+    (SVK, (8, 2), 1, 5, -6.3661, None, 4),
+    (SVK, (8, 2), 1, 20, -24.79226, None, 6),
+    (SVK, (8, 2), 1, 40, -44.77862, None, 7),
+    (NH, (8, 2), 1, 40, -44.71446, None, 8),
+    (SVK, (16, 4), 1, 5, -7.06306, None, 4),
+    (SVK, (16, 4), 1, 20, -27.28787, None, 6),
+    (SVK, (16, 4), 1, 40, -48.38715, None, 7),
+    (NH, (16, 4), 1, 40, -48.34221, None, 7),
+    (SVK, (4, 1), 2, 5, -7.20015, None, None),
+    (SVK, (4, 1), 2, 20, -27.72827, None, None),
+    (SVK, (4, 1), 2, 40, -48.8317, None, None),
+    (NH, (4, 1), 2, 40, -48.76971, None, None),
 ]
 FINE_BEAMS = [
-    (SVK, (39, 9), "hexahedron", 1, 5, -7.30886, None, 4),
-    (SVK, (39, 9), "hexahedron", 1, 20, -28.15840, None, 6),
-    (SVK, (39, 9), "hexahedron", 1, 40, -49.62752, -5.92339, 7),
-    (NH, (39, 9), "hexahedron", 1, 40, -49.59254, None, None),
-    (SVK, (8, 2), "hexahedron", 2, 20, -28.2134, None, None),
-    (NH, (8, 2), "hexahedron", 2, 40, -49.65505, None, None),
-    (SVK, (16, 4), "hexahedron", 2, 40, -49.88316, -6.03441, None),
-    (NH, (16, 4), "hexahedron", 2, 40, -49.8554, None, None),
+    (SVK, (39, 9), 1, 5, -7.30886, None, 4),
+    (SVK, (39, 9), 1, 20, -28.15840, None, 6),
+    (SVK, (39, 9), 1, 40, -49.62752, -5.92339, 7),
+    (NH, (39, 9), 1, 40, -49.59254, None, None),
+    (SVK, (8, 2), 2, 20, -28.2134, None, None),
+    (NH, (8, 2), 2, 40, -49.65505, None, None),
+    (SVK, (16, 4), 2, 40, -49.88316, -6.03441, None),
+    (NH, (16, 4), 2, 40, -49.8554, None, None),
 ]
 
 
 @pytest.mark.parametrize(
-    ("law", "cells", "cell", "degree", "q", "z", "x", "count"),
-    BEAMS + [pytest.param(*beam, marks=pytest.mark.slow) for beam in FINE_BEAMS],
+    ("law", "cells", "degree", "q", "z", "x", "count", "mixed"),
+    [(*beam, False) for beam in BEAMS]
+    + [(*beam, True) for beam in BEAMS if beam[1] == (8, 2)]
+    + [
+        pytest.param(*beam, mixed, marks=pytest.mark.slow)
+        for beam in FINE_BEAMS
+        for mixed in (False, True)
+    ],
 )
-def test_beam_bends_as_tabulated(
-    beam, pull, corner, mixed, law, cells, cell, degree, q, z, x, count
-):
+def test_beam_bends_as_tabulated(beam, pull, corner, law, cells, degree, q, z, x, count, mixed):
     """The paper's beam to 1e-6, and the iterations of plain Newton (independent code)."""
-    problem = beam(law, *cells, cell=cell, degree=degree)
+    problem = beam(law, *cells, degree=degree)
     backend = "auto" if cells[0] * degree > 16 else "superlu"
     answer = fem.solve(
         newton(problem, linear=backend, mixed_integration=mixed), load_of(pull(problem, q))
@@ -125,9 +126,9 @@ def test_residual_falls_with_the_second_order(beam, pull, law, q):
     assert math.log(c / b) / math.log(b / a) >= 1.9
 
 
-def test_one_step_squares_the_error(law, beam, pull):
+def test_one_step_squares_the_error(beam, pull):
     """Half the error in the guess leaves a quarter of the error after one iteration."""
-    problem = beam(law)
+    problem = beam(NH)
     load = load_of(pull(problem, 20.0))
     answer = fem.solve(newton(problem, tol=1e-12), load).displacement
     left = []
@@ -137,27 +138,6 @@ def test_one_step_squares_the_error(law, beam, pull):
         left.append((next(states).displacement - answer).norm() / (error * answer.norm()))
     assert left[0] < 0.1
     assert [(a / b).item() for a, b in pairwise(left)] == pytest.approx([2.0, 2.0], rel=0.02)
-
-
-@pytest.mark.parametrize("length", [1e-3, 1.0, 1e3, 100.0])
-@pytest.mark.parametrize(
-    ("law", "printed"),
-    [
-        (SVK, [8.023468838e-3, -2.392426382e-4, -0.2479226415]),
-        (NH, [1.024683172e-2, -2.397967447e-4, -0.2477360716]),
-    ],
-    ids=["svk", "neo-hookean"],
-)
-def test_answer_does_not_depend_on_the_size_of_the_body(pull, corner, law, printed, length):
-    """The same u/L in six iterations at q/E = 20/4500, for any E and L."""
-    mesh = fem.box([length, length / 4, length / 4], [9, 3, 3])
-    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"))
-    answer = fem.solve(
-        newton(problem, mixed_integration=False, factor_reuse_tol=0.0), load_of(pull(problem, 20.0))
-    )
-    assert problem.length == pytest.approx(length)
-    assert corner(problem, answer.displacement).tolist() == pytest.approx(printed, rel=1e-9)
-    assert answer.iterations.item() == 6
 
 
 def test_tiny_loads_converge_to_the_linear_answer(law, beam, pull, corner):
@@ -176,9 +156,9 @@ def test_tiny_loads_converge_to_the_linear_answer(law, beam, pull, corner):
     assert deviations[1] / loads[1] == pytest.approx(deviations[2] / loads[2], rel=0.01)
 
 
-def test_no_load_costs_nothing(law, beam, monkeypatch):
+def test_no_load_costs_nothing(beam, monkeypatch):
     """Stress case T6: zero load, u = 0, 0 iterations, no factor."""
-    problem = beam(law)
+    problem = beam(NH)
     monkeypatch.setattr(SuperLU, "factorise", None)
     states = list(newton(problem).iterate(load_of(torch.zeros(1, *problem.shape).double())))
     assert len(states) == 1
@@ -186,75 +166,6 @@ def test_no_load_costs_nothing(law, beam, monkeypatch):
     assert states[0].converged.all()
     assert states[0].iterations.item() == states[0].factorisations.item() == 0
     assert states[0].load_factor.item() == 1
-
-
-@pytest.mark.parametrize(
-    ("law", "deepest", "volume"), [(SVK, None, 0.720), (NH, -0.7239, 0.804)], ids=["T1", "T3"]
-)
-def test_four_times_the_training_load_converges(beam, pull, mixed, law, deepest, volume):
-    """Stress cases T1 and T3, q = 80 on hex8 16 x 4 x 4."""
-    problem = beam(law, 16, 4)
-    answer = fem.solve(newton(problem, mixed_integration=mixed), load_of(pull(problem, 80.0)))
-    assert answer.converged.all()
-    assert answer.volume_ratio.item() == pytest.approx(volume, abs=5e-4)
-    if deepest is not None:
-        assert answer.displacement[..., 2].min().item() == pytest.approx(deepest, abs=5e-5)
-
-
-@pytest.mark.parametrize(
-    ("q", "deepest", "volume"),
-    [
-        (160.0, -0.9179, 0.723),
-        pytest.param(400.0, -1.1102, 0.590, marks=pytest.mark.slow),
-        pytest.param(1000.0, -1.3502, 0.443, marks=pytest.mark.slow),
-    ],
-)
-def test_neo_hookean_beam_answers_any_load(beam, pull, mixed, q, deepest, volume):
-    """Stress case T4."""
-    problem = beam(NH, 16, 4)
-    for state in newton(problem, mixed_integration=mixed).iterate(load_of(pull(problem, q))):
-        assert state.volume_ratio.item() > 0
-    assert state.converged.all()
-    assert state.load_factor.item() == 1
-    assert state.displacement[..., 2].min().item() == pytest.approx(deepest, abs=1e-4)
-    assert state.volume_ratio.item() == pytest.approx(volume, abs=1e-3)
-
-
-@pytest.mark.slow
-def test_slender_beam_needs_load_steps_and_gets_there(pull):
-    """Stress case T5: NH-ln 20 x 1 x 1, nu = 0, hex27, P L^2 / EI = 1: w / L = .302130893."""
-    mesh = fem.box([20.0, 1.0, 1.0], [21, 2, 2])
-    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(0.0), fixed=fem.Plane(0, "min"), degree=2)
-    answer = fem.solve(newton(problem, linear="auto"), load_of(pull(problem, 4500.0 / 12 / 400)))
-    assert answer.converged.all()
-    end = problem.points[:, 0] == problem.points[:, 0].max()
-    force = pull(problem, 1.0)[0, end, 2]
-    sag = (answer.displacement[0, end, 2] * force).sum() / force.sum()  # mean over the section
-    assert -sag.item() == pytest.approx(0.302130893, rel=1e-3)
-
-
-def check_defeat(problem: fem.Problem, solver: fem.Newton, force: torch.Tensor) -> None:
-    """Assert that a load without an answer ends as stress case T2 requires."""
-    for state in solver.iterate(load_of(force)):
-        assert state.volume_ratio.item() > 0
-        assert state.residual.isfinite().all()
-        assert not state.converged.any()
-    assert state.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
-    factor = state.load_factor.item()
-    assert 0 < factor < 1
-    rest = fem.evaluate_solution(
-        problem, state.displacement, load_of(factor * force), solver.intermediate_tol
-    )
-    assert rest.converged.all()
-    assert state.residual.item() == problem.relative_residual(state.displacement, force).item()
-
-
-@pytest.mark.parametrize("q", [400.0, 1000.0])
-def test_load_without_an_answer_is_reported_with_the_part_that_has_one(beam, pull, mixed, q):
-    """Stress case T2: SVK far beyond its limit."""
-    problem = beam(SVK)
-    solver = newton(problem, min_load_step=2.0**-6, mixed_integration=mixed)
-    check_defeat(problem, solver, pull(problem, q))
 
 
 @pytest.mark.parametrize("most", [3, 4])
@@ -275,14 +186,6 @@ def test_a_load_step_is_at_most_twice_the_one_before(most):
     assert_close(states[-1].displacement, whole.displacement, rtol=0, atol=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("q", [160.0, 400.0, 1000.0])
-def test_load_without_an_answer_on_the_finer_mesh_is_reported(beam, pull, mixed, q):
-    """Stress case T2 on hex8 16 x 4 x 4."""
-    problem = beam(SVK, 16, 4)
-    check_defeat(problem, newton(problem, mixed_integration=mixed), pull(problem, q))
-
-
 def test_squeezed_block_fails_where_its_law_softens(mixed):
     """An SVK bar has a solution up to |P| = E / (3 sqrt 3), and none beyond (closed form)."""
     mesh = fem.box([1.0, 1.0, 1.0], [2, 2, 2])
@@ -300,9 +203,9 @@ def test_squeezed_block_fails_where_its_law_softens(mixed):
     assert above.load_factor.item() == pytest.approx(1 / 1.05, abs=0.02)
 
 
-def test_batch_solves_like_its_members(law, beam, pull):
+def test_batch_solves_like_its_members(beam, pull):
     """Members that need 0, 2, 4, 7 or no end of iterations do not disturb each other."""
-    problem = beam(law, 4, 1)
+    problem = beam(SVK, 4, 1)
     force = torch.cat([pull(problem, q) for q in (0.0, 1e-3, 5.0, 40.0, 2000.0)])
     solver = newton(problem, min_load_step=2.0**-4)
     batch = fem.solve(solver, load_of(force))
@@ -312,26 +215,34 @@ def test_batch_solves_like_its_members(law, beam, pull):
     assert len(set(batch.iterations.tolist())) == 5
 
 
-def test_states_are_yielded_from_the_start_one_by_one(law, beam, pull):
-    problem = beam(law)
-    states = list(newton(problem).iterate(load_of(pull(problem, 20.0))))
+def test_states_are_yielded_from_the_start_one_by_one(beam, pull):
+    problem = beam(NH)
+    load = load_of(pull(problem, 20.0))
+    states = list(newton(problem).iterate(load))
     assert not states[0].displacement.any()
     assert states[0].residual.item() == 1
     assert [s.iterations.item() for s in states] == list(range(len(states)))
     assert [s.converged.item() for s in states] == [False] * (len(states) - 1) + [True]
     assert [s.load_factor.item() for s in states] == [0.0] * (len(states) - 1) + [1.0]
+    assert [s.negative_pivots.item() for s in states] == [-1] * (len(states) - 1) + [0]
+    seconds = [s.seconds.item() for s in states]
+    assert seconds[0] > 0
+    assert all(a < b for a, b in pairwise(seconds))
     for state in states:
-        again = fem.evaluate_solution(
-            problem, state.displacement, load_of(pull(problem, 20.0)), 1e-8
-        )
+        again = fem.evaluate_solution(problem, state.displacement, load, 1e-8)
         assert torch.equal(again.residual, state.residual)
         assert torch.equal(again.volume_ratio, state.volume_ratio)
+    linear = fem.solve(fem.LinearSolver(problem, linear="superlu"), load)
+    assert torch.equal(linear.displacement, states[1].displacement)
+    assert torch.equal(linear.residual, states[1].residual)
+    assert not linear.converged.any()
+    assert linear.iterations.item() == 1
 
 
-@pytest.fixture
-def wrong(law, beam, pull) -> tuple[fem.Problem, fem.Load, fem.Solution]:
+@pytest.fixture(scope="module")
+def wrong(beam, pull) -> tuple[fem.Problem, fem.Load, fem.Solution]:
     """A problem, its load and its answer from zero."""
-    problem = beam(law)
+    problem = beam(NH)
     load = load_of(pull(problem, 20.0))
     return problem, load, fem.solve(newton(problem), load)
 
@@ -421,8 +332,8 @@ def test_guess_of_the_held_nodes_is_not_believed(wrong):
     assert not end.displacement[:, ~problem.free].any()
 
 
-def test_members_use_their_own_guess(law, beam, pull):
-    problem = beam(law, 4, 1)
+def test_members_use_their_own_guess(beam, pull):
+    problem = beam(NH, 4, 1)
     load = load_of(torch.cat([pull(problem, q) for q in (5.0, 20.0, 40.0)]))
     answer = fem.solve(newton(problem), load)
     guess = answer.displacement.clone()
@@ -465,37 +376,21 @@ def test_force_that_is_no_number_has_no_answer_even_on_a_held_node(beam, pull, b
 
 
 @pytest.mark.parametrize(
-    "option",
+    ("name", "value"),
     [
-        *(
-            {name: value}
-            for name in ("tol", "intermediate_tol", "min_detF_ratio", "min_load_step")
-            for value in (0, 1)
-        ),
-        *(
-            {"tol": -1e-8},
-            {"tol": math.nan},
-            {"max_iter": 0},
-            {"max_iter": -3},
-            {"max_total_iter": 0},
-        ),
+        *product(("tol", "intermediate_tol", "min_detF_ratio", "min_load_step"), (0, 1)),
+        *(("tol", -1e-8), ("tol", math.nan), ("max_iter", 0), ("max_iter", -3)),
+        *(("max_total_iter", 0), ("linear", "umfpack")),
     ],
-    ids=str,
 )
-def test_option_out_of_range_is_an_error_that_names_it(beam, option):
-    with pytest.raises(ValueError, match=next(iter(option))):
-        fem.Newton(beam(NH, 4, 1), **option)
+def test_option_out_of_range_is_an_error_that_names_it(beam, name, value):
+    with pytest.raises(ValueError, match=f"{name} = "):
+        fem.Newton(beam(NH, 4, 1), **{name: value}).linear_solver.backend  # noqa: B018
 
 
-def test_unknown_backend_is_an_error(beam, pull):
-    problem = beam(NH, 4, 1)
-    with pytest.raises(ValueError, match="linear = "):
-        fem.solve(newton(problem, linear="umfpack"), load_of(pull(problem, 1.0)))
-
-
-def test_rest_state_is_factorised_once_for_all_loads(law, beam, pull, counted):
+def test_rest_state_is_factorised_once_for_all_loads(beam, pull, counted):
     """The factor of K(0) belongs to the scene and is not counted."""
-    problem = beam(law)
+    problem = beam(NH)
     solver, load = newton(problem, factor_reuse_tol=0.0), load_of(pull(problem, 20.0))
     first = fem.solve(solver, load)
     assert first.factorisations.item() == first.iterations.item() - 1
@@ -506,8 +401,8 @@ def test_rest_state_is_factorised_once_for_all_loads(law, beam, pull, counted):
     assert torch.equal(first.displacement, second.displacement)
 
 
-def test_load_whose_linear_answer_will_do_costs_no_factorisation(law, beam, pull, counted):
-    problem = beam(law)
+def test_load_whose_linear_answer_will_do_costs_no_factorisation(beam, pull, counted):
+    problem = beam(NH)
     solver = newton(problem)
     for q in (1e-10, 2e-10, 3e-10):
         answer = fem.solve(solver, load_of(pull(problem, q)))
@@ -517,22 +412,11 @@ def test_load_whose_linear_answer_will_do_costs_no_factorisation(law, beam, pull
     assert len(counted) == 1  # the rest state
 
 
-def test_linear_answer_is_the_first_iterate(law, beam, pull):
-    problem = beam(law)
-    load = load_of(pull(problem, 5.0))
-    states = list(newton(problem).iterate(load))
-    linear = fem.solve(fem.LinearSolver(problem, linear="superlu"), load)
-    assert torch.equal(linear.displacement, states[1].displacement)
-    assert torch.equal(linear.residual, states[1].residual)
-    assert not linear.converged.any()
-    assert linear.iterations.item() == 1
-
-
 @pytest.mark.parametrize("name", [name for name in BACKENDS if name != "superlu"])
-def test_backends_give_the_same_answer(law, beam, pull, name):
+def test_backends_give_the_same_answer(beam, pull, name):
     if name not in fem.installed_backends():
         pytest.skip(f"{name} is not installed")
-    problem = beam(law)
+    problem = beam(NH)
     load = load_of(pull(problem, 20.0))
     first, second = (fem.solve(newton(problem, linear=one), load) for one in ("superlu", name))
     assert second.converged.all()
@@ -549,7 +433,7 @@ def test_solver_without_pardiso_solves_the_same(beam, pull, monkeypatch):
     assert torch.equal(fem.solve(fem.Newton(problem), load).displacement, expected.displacement)
 
 
-@pytest.mark.parametrize("q", [5.0, 20.0, 40.0])
+@pytest.mark.parametrize("q", [5.0, 40.0])
 def test_mixed_points_find_the_same_answer_in_fewer_iterations(law, beam, pull, q):
     """Magisano, Leonetti, Garcea (2017)."""
     problem = beam(law)
@@ -591,25 +475,8 @@ def test_pickled_solver_answers_the_same(beam, pull, kind):
     assert torch.equal(fem.solve(copy, load).displacement, answer.displacement)
 
 
-def test_moved_supports_pull_the_body_along(law, mixed):
-    """A bar stretched by its ends has the closed-form lateral stretch at 1.5."""
-    mesh = fem.box([1.0, 1.0, 1.0], [3, 3, 3])
-    held = mesh.p.T == 0
-    held[:, 0] |= mesh.p[0] == 1
-    given = np.where(mesh.p[0] == 1, 0.5, 0.0)[:, None] * np.array([1, 0, 0])
-    problem = fem.Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0)
-    none = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    answer = fem.solve(newton(problem, tol=1e-12, mixed_integration=mixed), load_of(none))
-    assert answer.converged.all()
-    assert answer.load_factor.item() == 1
-    far = problem.points.sum(dim=1).argmax()
-    lateral = {fem.SaintVenantKirchhoff: 0.79056942, fem.NeoHookeanLn: 0.88017459}[type(law)]
-    end = 1 + answer.displacement[0, far]
-    assert end.tolist() == pytest.approx([1.5, lateral, lateral], abs=6e-9)
-
-
-def test_judge_believes_nothing(law, beam, pull):
-    problem = beam(law, 4, 1)
+def test_judge_believes_nothing(beam, pull):
+    problem = beam(NH, 4, 1)
     load = load_of(torch.cat([pull(problem, 20.0)] * 3))
     claims = torch.zeros_like(load.force)
     claims[1] = fem.solve(newton(problem), load_of(load.force[:1])).displacement[0]
@@ -623,48 +490,9 @@ def test_judge_believes_nothing(law, beam, pull):
     assert verdict.volume_ratio[2].item() == -math.inf
 
 
-@pytest.fixture(scope="module")
-def column() -> fem.Problem:
-    """A column of 10 x 1 x 1 m: ten hex27 of SVK, nu = 0."""
-    mesh = fem.box([10.0, 1.0, 1.0], [11, 2, 2])
-    return fem.Problem.build(
-        mesh, fem.SaintVenantKirchhoff(0.0), fixed=fem.Plane(0, "min"), degree=2
-    )
-
-
-@pytest.fixture
-def squeezed(column) -> Callable[[float], fem.Solution]:
-    """Solutions under an axial dead load P, E = 1000 Pa."""
-
-    def squeezed(P: float) -> fem.Solution:
-        force = fem.Traction(fem.Plane(0, "max"), [-P / 1000, 0.0, 0.0]).on(column)[None]
-        return fem.solve(newton(column), load_of(force))
-
-    return squeezed
-
-
-def test_column_below_its_critical_load_is_stable(squeezed):
-    """K becomes singular at P = 2.039763 (independent code)."""
-    answer = squeezed(2.03)
-    assert answer.stable.all()
-    assert answer.status.item() == fem.Status.CONVERGED
-    assert answer.negative_pivots.item() == 0
-
-
-def test_straight_column_beyond_its_critical_load_is_flagged(squeezed):
-    """At P = 2.5 the straight state is an equilibrium with two negative eigenvalues."""
-    answer = squeezed(2.5)
-    assert answer.converged.all()
-    assert not answer.stable.any()
-    assert answer.status.item() == fem.Status.UNSTABLE
-    assert answer.negative_pivots.item() == 2
-    assert 10 * answer.displacement[..., 0].min().item() == pytest.approx(-0.02509, abs=5e-6)
-
-
 def test_status_reads_as_words():
-    assert [str(one) for one in fem.Status] == [
-        *("converged", "unstable", "no valid equilibrium", "not converged"),
-    ]
+    words = ["converged", "unstable", "no valid equilibrium", "not converged"]
+    assert [str(one) for one in fem.Status] == words
 
 
 @pytest.mark.parametrize("budget", [1, 3])
@@ -686,33 +514,6 @@ def test_answer_of_the_last_iteration_of_the_budget_counts(beam, pull):
     assert differing(spent, answer) == []
 
 
-def test_time_goes_on(beam, pull):
-    states = newton(beam(NH)).iterate(load_of(pull(beam(NH), 20.0)))
-    seconds = [state.seconds.item() for state in states]
-    assert seconds[0] > 0
-    assert all(a < b for a, b in pairwise(seconds))
-
-
-@pytest.mark.parametrize(
-    ("part", "deepest"),
-    [(1e-2, -0.2388289), (1e-4, -0.2386176), (1e-6, -0.2386155), (1e-8, -0.2386155)],
-)
-def test_slivers_end_where_rounding_ends_them(pull, corner, part, deepest):
-    """Stress case T11: the plane x = 50 moved to 37.5 + 12.5 eps."""
-    mesh = fem.box([LENGTH, 25.0, 25.0], [9, 3, 3])
-    points = mesh.p.copy()
-    points[0, points[0] == 50.0] = 37.5 + 12.5 * part
-    with pytest.warns(UserWarning, match="aspect ratio"):
-        problem = fem.Problem.build(type(mesh)(points, mesh.t), SVK, fixed=fem.Plane(0, "min"))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        answer = fem.solve(newton(problem), load_of(pull(problem, 20.0)))
-    reported = any("rounding allows no less" in str(w.message) for w in caught)
-    assert reported == bool(answer.residual > 1e-8) == (part == 1e-8)
-    assert answer.converged.all()
-    assert corner(problem, answer.displacement)[2].item() == pytest.approx(deepest, abs=6e-8)
-
-
 def test_linear_solves_are_as_exact_as_eisenstat_and_walker_ask():
     """Choice 2 of Eisenstat and Walker (1996), between 1e-12 and 1e-3."""
     term = partial(forcing_term, tol=1e-15, corotational=False)
@@ -723,13 +524,6 @@ def test_linear_solves_are_as_exact_as_eisenstat_and_walker_ask():
     first = float("nan")
     assert term(1.0, first) == 1e-12
     assert term(1.0, first, corotational=True) == 1e-3
-
-
-def test_stability_is_not_known_before_newton_ends(beam, pull):
-    problem = beam(NH, 4, 1)
-    states = list(fem.Newton(problem, linear="superlu").iterate(load_of(pull(problem, 20.0))))
-    assert [int(state.negative_pivots) for state in states[:-1]] == [-1] * (len(states) - 1)
-    assert int(states[-1].negative_pivots) == 0
 
 
 def test_the_solver_of_another_poissons_ratio_shares_what_does_not_depend_on_it(beam, pull):

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 import skfem
 import torch
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import eigsh
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -20,7 +18,7 @@ from dpl import fem
 from dpl.fem.linear import full_matrix
 
 YOUNG, LENGTH = 4500.0, 100.0  # of the paper's beam [Pa], [m]
-NH = fem.NeoHookeanLn(0.3)
+SVK, NH = fem.SaintVenantKirchhoff(0.3), fem.NeoHookeanLn(0.3)
 CORNER = skfem.MeshTet(
     np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), np.arange(4)[:, None]
 )
@@ -67,11 +65,10 @@ ELEMENTS = {
 }
 
 
-@pytest.mark.parametrize("material", [fem.SaintVenantKirchhoff, fem.NeoHookeanLn])
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_element_matrix_has_the_tabulated_eigenvalues(element, material):
+def test_element_matrix_has_the_tabulated_eigenvalues(element):
     mesh, degree, smallest, count, largest, trace = ELEMENTS[element]
-    K = stiffness(fem.Problem.build(mesh, material(0.3), degree=degree, length=1.0))
+    K = stiffness(fem.Problem.build(mesh, NH, degree=degree, length=1.0))
     values = np.linalg.eigvalsh(K)
     assert len(values) == count
     assert np.abs(values[:6]).max() < 1e-14
@@ -103,22 +100,6 @@ def test_homogeneous_strain_has_the_energy_of_hooke(element):
         (np.stack([x[:, 1], zero, zero], axis=1), 0.3846153846),
     ):
         assert u.ravel() @ K @ u.ravel() / volume == pytest.approx(printed, abs=6e-11)
-
-
-def test_beam_has_the_tabulated_stiffness(law, beam):
-    """Compare eigenvalues of K in N/m on free degrees of freedom, tolerance 1e-6."""
-    values = np.linalg.eigvalsh(stiffness(beam(law))) * YOUNG * LENGTH
-    printed = (
-        [21.24835125] * 2 + [163.64340492] + [536.30691952] * 2 + [867.54630154, 1433.87488669]
-    )
-    assert values[:7] == pytest.approx(printed, rel=1e-9)
-
-
-def test_finer_beam_has_the_tabulated_stiffness(beam):
-    K = csc_array(stiffness(beam(NH, 16, 4))) * YOUNG * LENGTH
-    values = np.sort(eigsh(K, 6, sigma=0.0, v0=np.arange(1.0, K.shape[0] + 1))[0])
-    printed = [3.88134628] * 2 + [37.40358032] + [98.17128826] * 2 + [165.64636884]
-    assert values == pytest.approx(printed, rel=1e-8)
 
 
 @pytest.fixture(scope="module")
@@ -171,25 +152,6 @@ def test_differences_of_force_follow_the_tangent(bent, direction):
     assert errors[2] < 1e-8
 
 
-def test_moved_and_turned_body_feels_turned_forces(bent):
-    """The tolerance is 1e-12."""
-    problem, _, u = bent
-    Q, X = rotation(), problem.points
-    moved = (X + u) @ Q.T + torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64) - X
-    force = problem.internal_force(u)
-    error = (problem.internal_force(moved) - force @ Q.T).norm() / force.norm()
-    assert error < 1e-12
-    assert_close(problem.energy(moved), problem.energy(u), rtol=1e-12, atol=0.0)
-    assert_close(problem.volume_ratio(moved), problem.volume_ratio(u), rtol=1e-12, atol=0.0)
-
-
-def test_turning_alone_needs_no_force(bent):
-    problem = bent[0]
-    turned = (problem.points @ (rotation() - torch.eye(3, dtype=torch.float64)).T)[None]
-    assert problem.internal_force(turned).norm() < 1e-14
-    assert problem.energy(turned).abs() < 1e-14
-
-
 def test_reactions_balance_the_load(bent):
     """Compare forces to 1e-10 of the load, moments about the deformed body to 1e-12."""
     problem, force, u = bent
@@ -198,16 +160,6 @@ def test_reactions_balance_the_load(bent):
     assert (reactions + force).sum(dim=(0, 1)).abs().max() < 1e-10 * force.sum().abs()
     moments = torch.linalg.cross(problem.points + u, internal)
     assert moments.sum(dim=1).abs().max() < 1e-12 * moments.norm(dim=2).sum()
-
-
-def test_linear_answers_are_reciprocal(bent):
-    """Maxwell and Betti: u_a(f_b) = u_b(f_a)."""
-    problem = bent[0]
-    linear = fem.LinearSolver(problem, linear="superlu")
-    random = torch.Generator().manual_seed(5)
-    a, b = torch.randn(2, *problem.shape, generator=random, dtype=torch.float64)
-    work = (linear.solve(a) * b).sum()
-    assert_close(work, (linear.solve(b) * a).sum(), rtol=1e-12, atol=0.0)
 
 
 def test_free_body_has_exactly_the_rigid_zero_modes(bent):
@@ -246,10 +198,13 @@ def test_slope_of_the_total_energy_over_the_load_is_the_displacement(bent, pull)
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.01)
 
 
+SVK_ON = [("quad", 1), ("tetra", 2), ("hexahedron", 1)]  # the elements with the other law
+
+
 @pytest.fixture
-def body(kind, law, grid) -> fem.Problem:
+def body(kind, grid) -> fem.Problem:
     """A body of each kind of element with unequal cells, held where x is small."""
-    cell, degree = kind
+    (cell, degree), law = kind, SVK if kind in SVK_ON else NH
     return fem.Problem.build(
         grid(cell, 2, 0.15), law, fixed=lambda points: points[:, 0] < 0.2, degree=degree, length=1.0
     )
@@ -283,8 +238,7 @@ def test_mixed_points_in_agreement_give_force_and_tangent(body, bend):
 
 def test_mixed_system_is_that_of_saint_venant_whatever_the_gap(kind, grid, bend):
     """A linear stress is moved to the strain of u exactly: only the tangent sees the mixed one."""
-    mesh = grid(kind[0], 2, 0.15)
-    body = fem.Problem.build(mesh, fem.SaintVenantKirchhoff(0.3), degree=kind[1], length=1.0)
+    body = fem.Problem.build(grid(kind[0], 2, 0.15), SVK, degree=kind[1], length=1.0)
     u, gap = bend(body.points, 2), body.tensors.strain(bend(body.points, 2, seed=1))
     force, tangent = body.tensors.mixed_system(u, gap)
     assert_close(force, body.internal_force(u), rtol=1e-11, atol=1e-14)
@@ -304,24 +258,23 @@ def test_stress_of_mixed_points_is_moved_to_the_strain_by_the_moduli_there(body,
         assert [math.log2(a / b) for a, b in pairwise(errors)] == pytest.approx([2.0] * 2, abs=0.05)
 
 
-@pytest.mark.parametrize("length", [1.0, 0.25])
-def test_gap_is_what_the_linear_change_of_strain_falls_short_of(kind, grid, bend, length):
+def test_gap_is_what_the_linear_change_of_strain_falls_short_of(kind, grid, bend):
     """Points close the part of the gap that the step takes and follow the slope of the strain."""
     body = Reference.build(grid(kind[0], 2, 0.15), NH, degree=kind[1], length=1.0)
     u, v = bend(body.points), bend(body.points, seed=1)
     gap = body.tensors.strain(bend(body.points, seed=2))
     slope = torch.func.jvp(body.tensors.strain, (u,), (v,))[1]
     for before, found in (
-        (torch.zeros_like(gap), body.update_strain_gap(None, length, v)),
-        (gap, body.update_strain_gap(gap, length, v)),
+        (torch.zeros_like(gap), body.update_strain_gap(None, 0.25, v)),
+        (gap, body.update_strain_gap(gap, 0.25, v)),
     ):
         mixed = body.tensors.strain(u) - before
-        moved = mixed + length * (slope + before)
-        assert_close(found, body.tensors.strain(u + length * v) - moved, rtol=1e-11, atol=1e-14)
+        moved = mixed + 0.25 * (slope + before)
+        assert_close(found, body.tensors.strain(u + 0.25 * v) - moved, rtol=1e-11, atol=1e-14)
 
 
-def test_equal_cells_answer_like_unequal_ones(kind, law, chain, bend):
-    cell, degree = kind
+def test_equal_cells_answer_like_unequal_ones(kind, chain, bend):
+    (cell, degree), law = kind, SVK if kind in SVK_ON else NH
     short = fem.Problem.build(chain(cell, 3), law, fixed=fem.Plane(0, "min"), degree=degree)
     assert short.discretisation.equal_cells
     count = len(short.cells)
@@ -356,7 +309,7 @@ def test_homogeneous_deformation_has_one_stress_and_one_volume_ratio(body):
 
 
 @pytest.mark.parametrize("degree", [1, 2])
-def test_plane_strain_is_a_slice_of_the_solid(law, bend, degree):
+def test_plane_strain_is_a_slice_of_the_solid(law, degree):
     flat = fem.Problem.build(fem.rectangle([2.0, 1.0], [5, 3]), law, degree=degree, length=1.0)
     solid = fem.Problem.build(fem.box([2.0, 1.0, 0.7], [5, 3, 2]), law, degree=degree, length=1.0)
 
@@ -368,15 +321,6 @@ def test_plane_strain_is_a_slice_of_the_solid(law, bend, degree):
     assert_close(
         solid.energy(in_space), 0.7 * flat.energy(shape(flat.points)), rtol=1e-12, atol=0.0
     )
-
-
-def test_inverted_body_is_seen(grid):
-    problem = fem.Problem.build(grid("hexahedron"), NH)
-    mirrored = problem.points * torch.tensor([-2.0, 0, 0], dtype=torch.float64)
-    assert problem.volume_ratio(mirrored[None]).item() == pytest.approx(-1.0, rel=1e-12)
-    lost = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    lost[0, 3, 1] = math.nan
-    assert problem.volume_ratio(lost).item() == -math.inf
 
 
 @pytest.fixture
@@ -423,7 +367,7 @@ def test_forces_on_held_nodes_do_not_count(held, bend):
     assert_close(held.relative_residual(u, only), held.residual(u, only).flatten(1).norm(dim=1))
 
 
-@pytest.mark.parametrize("power", [-290, -200, -158, -100, 100, 158, 200, 290])
+@pytest.mark.parametrize("power", [-290, -158, 158, 290])
 def test_a_ratio_does_not_depend_on_the_size_of_the_forces(bent, power):
     """Squares of these numbers are 0 or infinite in float64."""
     problem, force, u = bent
@@ -499,10 +443,9 @@ def test_reactions_of_supports_that_are_not_moved_never_count(grid, bend):
     assert_close(moved.relative_residual_of(internal, f), (off / norm)[None])
 
 
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
-def test_nodes_lie_where_the_shape_functions_say(grid, cell, degree):
+def test_nodes_lie_where_the_shape_functions_say(kind, grid):
     """A field linear in `points` has a constant gradient only where nodes and cells agree."""
+    cell, degree = kind
     problem = fem.Problem.build(grid(cell, 3, 0.1, inside=True), NH, degree=degree, length=1.0)
     x, count = problem.points, (3 * degree + 1) ** problem.shape[1]
     assert problem.shape[0] == count
@@ -578,22 +521,6 @@ def test_motions_that_no_support_holds_are_named(grid, cell, fixed, names):
     assert fem.Problem.build(mesh, NH, fixed=fixed).unconstrained_rigid_body_modes() == names
 
 
-def test_loose_motions_are_the_zero_modes(grid):
-    """Their number is that of the zero eigenvalues of K, for every support."""
-    random = np.random.default_rng(0)
-    mesh = grid("hexahedron", 2, 0.1)
-    for count in (1, 2, 3, 4, 5, 6, 7):
-        fixed = np.zeros((27, 3), dtype=bool)
-        fixed.ravel()[random.choice(81, count, replace=False)] = True
-        problem = fem.Problem.build(mesh, NH, fixed=fixed)
-        values = np.linalg.eigvalsh(stiffness(problem))
-        assert (
-            len(problem.unconstrained_rigid_body_modes())
-            == (values < 1e-10 * values[-1]).sum()
-            == max(0, 6 - count)
-        )
-
-
 def test_copy_on_a_device_and_copy_by_pickle_are_the_same_problem(bent):
     problem, force, u = bent
     for copy in (problem.to("cpu"), pickle.loads(pickle.dumps(problem))):
@@ -603,11 +530,10 @@ def test_copy_on_a_device_and_copy_by_pickle_are_the_same_problem(bent):
         assert replace(copy, material=NH).pattern is copy.pattern
 
 
-def test_strain_of_no_deformation_is_not_valid(kind, law, grid):
+def test_strain_of_no_deformation_is_not_valid(kind, grid):
     """Det C of the strain of u less the gap must be above zero: here it is 0.2 - 1 < 0."""
-    build = {"compiled": fem.Problem, "reference": Reference}
-    for owner in build.values():
-        body = owner.build(grid(kind[0]), law, degree=kind[1], length=1.0)
+    for owner in (fem.Problem, Reference):
+        body = owner.build(grid(kind[0]), NH, degree=kind[1], length=1.0)
         squeezed = -0.6 * body.points[None] * torch.eye(body.shape[1], dtype=torch.float64)[0]
         for length, valid in ((1.0, True), (2.0, False)):
             gap = body.update_strain_gap(None, length, squeezed)  # 0.36/2 and 1.44/2 along x

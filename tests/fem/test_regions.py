@@ -12,6 +12,8 @@ from skfem.io.meshio import to_meshio
 from dpl import fem
 from dpl.fem.mesh import facets_in, nodes_in
 
+pytestmark = pytest.mark.usefixtures("in_process")
+
 BAR = ([4.0, 1.0, 2.0], [5, 2, 3])
 ELEMENTS = {
     ("hexahedron", 1): skfem.ElementHex1,

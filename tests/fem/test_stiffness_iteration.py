@@ -39,7 +39,8 @@ LAWS = {  # and the number of terms
         3,
     ),
 }
-PAIRS = [(name, springs) for name in LAWS for springs in (False, True)]
+PAIRS = [(name, number % 2 == 1) for number, name in enumerate(LAWS)]
+PAIRS += [("Poisson's ratio", True)]
 
 
 @pytest.fixture(params=PAIRS, ids=lambda pair: f"{pair[0]}{', springs' if pair[1] else ''}")
@@ -124,8 +125,7 @@ def by_tensors(matrix, inverse, right, rtol, steps=60):
     return stiffness_iteration.conjugate_gradients(*maps, right, rtol, steps).numpy()
 
 
-@pytest.mark.parametrize("rtol", [1e-2, 1e-5, 1e-10])
-@pytest.mark.parametrize("scale", [1.0, 1e-200, 1e200])
+@pytest.mark.parametrize(("rtol", "scale"), [(1e-2, 1e200), (1e-5, 1.0), (1e-10, 1e-200)])
 def test_tensor_operations_do_the_steps_of_arrays_for_forces_of_any_size(rtol, scale):
     matrix, inverse, force = system()
     exact = scale * np.linalg.solve(matrix, force)

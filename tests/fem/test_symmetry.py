@@ -77,25 +77,18 @@ def check_group(group):
         assert_close(symmetry.rotation @ symmetry.rotation.mT, one, rtol=0, atol=1e-14)
 
 
-def test_every_symmetry_of_a_body_is_found(body):
+def test_all_symmetries_are_found_and_are_a_group_that_starts_with_the_identity(body, bend):
+    """The matrix that maps the nodes is the one that rotates vectors."""
     problem, order = body
-    assert len(fem.symmetries(problem)) == order
-
-
-def test_symmetries_are_a_group_that_starts_with_the_identity(body, bend):
-    problem, _ = body
     group = fem.symmetries(problem)
+    assert len(group) == order
     check_group(group)
     assert torch.equal(group[0].rotation, torch.eye(problem.shape[1], dtype=torch.float64))
     assert group[0].source.tolist() == list(range(problem.shape[0]))
     field = bend(problem.points, 2)
     assert torch.equal(group[0].image(field), field)
-
-
-def test_symmetries_map_nodes_by_the_matrix_that_rotates_vectors(body):
-    problem, _ = body
     points = problem.points - problem.points.mean(dim=0)
-    for symmetry in fem.symmetries(problem):
+    for symmetry in group:
         assert_close(symmetry.image(points), points, rtol=0, atol=1e-14)
 
 
@@ -229,7 +222,7 @@ def test_neither_size_nor_place_nor_numbering_matters():
         assert len(fem.symmetries(fem.Problem.build(mesh, NH, fixed=LEFT))) == 8
 
 
-@pytest.mark.parametrize("shaken", [1e-8, 1e-3, 0.1])
+@pytest.mark.parametrize("shaken", [1e-8, 0.1])
 def test_distorted_meshes_have_the_identity_only(grid, kind, shaken):
     """Shaken by 1e-8 the nodes look symmetric, but images of answers would not be exact."""
     problem = fem.Problem.build(grid(kind[0], 2, shaken), NH, fixed=None, degree=kind[1])
@@ -253,17 +246,17 @@ def test_degree_does_not_matter(degree):
     assert len(fem.symmetries(fem.Problem.build(mesh, NH, fixed=LEFT, degree=degree))) == 2
 
 
-@pytest.mark.parametrize("mean", [False, True])
-def test_isotropic_laws_do_not_matter(isotropic_law, mean):
+def test_isotropic_laws_do_not_matter(isotropic_law):
+    """Of tetrahedra nodes are symmetric and cells are not: images of displacements fold cells."""
+    for cell, order in (("hexahedron", 8), ("tetra", 2)):
+        mesh = fem.box([4.0, 1.0, 1.0], [5, 3, 3], cell)
+        assert len(fem.symmetries(fem.Problem.build(mesh, isotropic_law, fixed=LEFT))) == order
+
+
+def test_mean_dilatation_does_not_matter():
     mesh = fem.box([4.0, 1.0, 1.0], [5, 3, 3])
-    problem = fem.Problem.build(mesh, isotropic_law, fixed=LEFT, mean_dilatation=mean)
+    problem = fem.Problem.build(mesh, NH, fixed=LEFT, mean_dilatation=True)
     assert len(fem.symmetries(problem)) == 8
-
-
-def test_no_law_fails_on_motions_that_are_no_symmetries(isotropic_law):
-    """Nodes that are symmetric and cells that are not: images of displacements fold the cells."""
-    mesh = fem.box([4.0, 1.0, 1.0], [5, 3, 3], "tetra")
-    assert len(fem.symmetries(fem.Problem.build(mesh, isotropic_law, fixed=LEFT))) == 2
 
 
 @dataclass(frozen=True)
@@ -363,13 +356,13 @@ def test_images_of_solutions_are_solutions_of_the_images_of_their_loads(solver):
 
 
 @pytest.mark.parametrize("mean", [False, True])
-def test_images_of_solutions_with_moved_supports_and_springs_are_solutions(law, mean):
+def test_images_of_solutions_with_moved_supports_and_springs_are_solutions(mean):
     supports = [
         fem.DirichletBC(LEFT),
         fem.DirichletBC(RIGHT, [0.1, None, None]),
         fem.RobinBC(fem.Plane(2, "min"), 0.3),
     ]
-    problem = fem.Problem.build(CUBE, law, supports=supports, mean_dilatation=mean)
+    problem = fem.Problem.build(CUBE, NH, supports=supports, mean_dilatation=mean)
     force = fem.Traction(fem.Plane(1, "max"), [0.01, -0.03, 0.02]).on(problem)
     answer = fem.solve(fem.Newton(problem, linear="superlu"), fem.Load(force[None], torch.ones(1)))
     assert answer.converged.all()
