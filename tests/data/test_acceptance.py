@@ -29,18 +29,6 @@ def test_every_load_lies_in_the_bin_whose_limits_enclose_its_amplitude():
     assert parts[-1].high == pytest.approx(amplitudes.max())
 
 
-def test_the_largest_load_lies_in_the_last_bin():
-    (*_, last) = amplitude_bins([0.1, 3.0, 3.0], [True, False, True])
-    assert last == AmplitudeBin(pytest.approx(2.7), 3.0, 2, 1)
-
-
-def test_empty_bins_are_left_out():
-    assert [(part.tried, part.accepted) for part in amplitude_bins([0.05, 1.0], [True, True])] == [
-        (1, 1),
-        (1, 1),
-    ]
-
-
 def test_no_loads_make_no_bins_and_zero_loads_make_one():
     assert amplitude_bins([], []) == []
     (only,) = amplitude_bins([0.0, 0.0], [True, False])

@@ -11,7 +11,7 @@ import torch
 
 from dpl import Sample
 from dpl.data import DataModule, Stream
-from dpl.data.solving.solve import LoadKey, solve_load
+from dpl.data.solving.solve import solve_load
 from dpl.fem import symmetries
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
@@ -205,13 +205,6 @@ def test_validation_and_test_keep_their_order_and_have_no_images(offline, symmet
     assert forces(module.test_dataloader()) == forces([module.samples("test")])
 
 
-def test_images_of_a_sample_are_spread_over_the_epoch(offline):
-    """Images are shuffled like samples."""
-    module = offline(symmetry=True, batch_size=12)
-    norms = [batch.force.flatten(1).norm(dim=1) for batch in module.train_dataloader()]
-    assert any(len((n / n.max()).mul(1e9).round().unique()) < 12 for n in norms)
-
-
 def test_a_force_in_every_load_breaks_the_symmetries_that_turn_it(make_scene, tmp_path):
     scene = make_scene()
     down = torch.zeros(scene.problem.shape, dtype=torch.float64)
@@ -391,10 +384,3 @@ def test_a_stream_does_not_raise_the_number_of_threads(online):
     after = torch.get_num_threads()
     torch.set_num_threads(before)
     assert after == 1
-
-
-def test_the_stream_has_the_seed_of_the_training_split(scene, online):
-    stream = online().train_dataloader().stream
-    truth = solve_load(scene, LoadKey((0, 0), 0))
-    _, one = next(iter(stream))
-    assert torch.equal(one.displacement, torch.from_numpy(truth.displacement))

@@ -7,42 +7,21 @@ import shutil
 import pytest
 import torch
 from safetensors.torch import load_file, save
+from set_files import content, flaws, lines
 
-from dpl.data import DataSet, Store
-from dpl.data.storage.integrity import check_modes, repair, verify
+from dpl.data import DataSet
+from dpl.data.storage.integrity import check_modes, repair
 
 SIZES = {"train": 12, "val": 4, "test": 4}
-
-
-@pytest.fixture
-def copy(data, tmp_path):
-    """A copy of the tiny data set that may be damaged."""
-    folder = tmp_path / "copy"
-    shutil.copytree(data.store.folder, folder)
-    return Store(folder, data.scene, data.store.seed)
 
 
 def wanted(store, **sizes):
     return DataSet(store.scene, str(store.folder), **{**SIZES, **sizes}, workers=0)
 
 
-def lines(store):
-    return [json.loads(line) for line in (store.folder / "manifest.jsonl").read_text().splitlines()]
-
-
 def write(store, found):
     text = "".join(line if isinstance(line, str) else json.dumps(line) + "\n" for line in found)
     (store.folder / "manifest.jsonl").write_text(text)
-
-
-def content(folder):
-    return {
-        p.name: p.read_bytes() for p in [*folder.glob("*.safetensors"), *folder.glob("m*.jsonl")]
-    }
-
-
-def flaws(store):
-    return {part.file: flaw for part, flaw in verify(store) if flaw}
 
 
 # ------------------------------------------------------------------ flaws
@@ -184,9 +163,7 @@ def flip_lowest_bit(path, column):
     path.write_bytes(whole)
 
 
-@pytest.mark.parametrize(
-    "column", ["displacement", "nodal_force", "point", "residual", "volume_ratio", "iterations"]
-)
+@pytest.mark.parametrize("column", ["displacement", "nodal_force", "iterations"])
 def test_verify_finds_a_flipped_bit_that_only_the_digest_detects(copy, column):
     """Equilibrium, loads and shapes stay within their tolerances."""
     path = copy.folder / "train-000000.safetensors"

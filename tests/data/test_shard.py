@@ -147,8 +147,10 @@ def test_forces_on_nodes_that_do_not_exist_are_refused(name, values, sound):
         decode_shard(change(name, values), SHAPE, DIMENSION)
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-@pytest.mark.parametrize("name", ["point", "nodal_force", "displacement"])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("point", np.nan), ("nodal_force", np.inf), ("displacement", -np.inf)],
+)
 def test_numbers_of_a_sample_that_are_not_finite_are_refused(name, value):
     columns = load(content(solved(5)))
     columns[name].view(-1)[-1] = value

@@ -48,16 +48,6 @@ def test_a_solution_does_not_depend_on_the_scene_object_its_size_and_stiffness(
     )
 
 
-def test_streams_and_numbers_name_different_loads(scene):
-    forces = {
-        solve_load(scene, LoadKey((seed, stream), number)).force.tobytes()
-        for seed in (0, 1)
-        for stream in (0, 1)
-        for number in (0, 1)
-    }
-    assert len(forces) == 8
-
-
 def test_residual_and_volume_ratio_belong_to_the_returned_displacement(scene, jobs):
     for job in jobs:
         one = solve_load(scene, job)

@@ -45,7 +45,7 @@ def errors_of(answer, scene, truth):
     return (u - truth).flatten(1).norm(dim=1) / truth.flatten(1).norm(dim=1)
 
 
-@pytest.mark.parametrize("part", [0.95, 0.99, 1.001, 1 + 1e-6])
+@pytest.mark.parametrize("part", [0.95, 1.001, 1 + 1e-6])
 def test_a_network_without_modes_reports_its_error_within_a_factor_of_five(
     scene, forces, truth, part
 ):

@@ -64,16 +64,6 @@ def test_the_median_of_infinite_values_is_infinite_and_of_nan_is_nan():
     assert median(torch.tensor([1.0, nan, 3.0])).isnan()
 
 
-def test_batches_accumulate_to_the_same_as_one(scene, prediction, batch):
-    whole, parts = default_metrics(scene.problem), default_metrics(scene.problem)
-    whole.update(prediction, batch)
-    for start, end in ((0, 5), (5, 6), (6, 12)):
-        parts.update(prediction[start:end], Sample(*(column[start:end] for column in batch)))
-    assert {k: float(v) for k, v in parts.compute().items()} == pytest.approx(
-        {k: float(v) for k, v in whole.compute().items()}, rel=1e-12
-    )
-
-
 def test_batches_accumulate_in_the_forward_method(scene, prediction, batch):
     """A collection that is called returns the metrics of the batch and accumulates them."""
     found, whole = default_metrics(scene.problem), default_metrics(scene.problem)
@@ -102,15 +92,6 @@ def test_the_body_is_evaluated_once_per_batch(scene, prediction, batch, monkeypa
     assert len(calls) == 3
 
 
-def test_metrics_forget_on_reset(scene, prediction, batch):
-    found = default_metrics(scene.problem)
-    found.update(batch.displacement + 1.0, batch)
-    found.reset()
-    found.update(prediction, batch)
-    expected = by_hand(scene.problem, prediction, batch)
-    assert float(found.compute()["e_max"]) == pytest.approx(expected["e_max"])
-
-
 def test_errors_of_single_precision_predictions_are_computed_in_double_precision(
     scene, prediction, batch
 ):
@@ -129,25 +110,6 @@ def test_noise_of_a_tenth_of_the_signal_is_20_dB_and_printed_as_10(batch):
         snr = MinSNR(printed=printed)
         snr.update(scaled, shifted)
         assert float(snr.compute()) == pytest.approx(decibels, abs=1e-9)
-
-
-def test_relative_l2_is_the_printed_power_of_the_snr(batch, prediction):
-    """The relative L2 error is 10^(-SNR/20) if both refer to the same norm."""
-    snr = MinSNR().measure(prediction, batch)
-    size = prediction.flatten(1).norm(dim=1) / batch.displacement.flatten(1).norm(dim=1)
-    relative = RelativeL2().measure(prediction, batch)
-    assert torch.allclose(relative, size * 10 ** (-snr / 20), rtol=1e-10)
-
-
-def test_one_bad_node_of_one_load_is_the_largest_error(batch):
-    wrong = batch.displacement.clone()
-    wrong[3, 7] += torch.tensor([3.0, 0.0, 4.0])
-    largest = MaxError()
-    largest.update(wrong, batch)
-    assert float(largest.compute()) == pytest.approx(5.0)
-    mean = MeanError()
-    mean.update(wrong, batch)
-    assert float(mean.compute()) == pytest.approx(5.0 / (wrong[0].numel() * len(wrong)))
 
 
 def test_the_reference_solution_has_zero_residual_and_infinite_snr(scene, batch):

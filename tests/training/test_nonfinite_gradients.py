@@ -52,8 +52,9 @@ GOOD = [torch.tensor([[x], [-x]]) for x in torch.linspace(0.5, 1.5, 40).tolist()
 BAD = torch.tensor([[1.0], [torch.nan]])
 
 
-@pytest.mark.parametrize("kind", ["loss", "slope"])
-@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+@pytest.mark.parametrize(
+    ("optimizer", "kind"), [("adam", "loss"), ("muon", "slope"), ("sgd", "slope")]
+)
 def test_a_step_with_nonfinite_gradients_changes_nothing_and_is_counted(
     tmp_path, capsys, optimizer, kind
 ):

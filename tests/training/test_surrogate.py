@@ -96,17 +96,15 @@ def test_relative_predictions_do_not_depend_on_size_and_stiffness(make_scene, sc
     assert torch.allclose(soft, stiff, rtol=0, atol=1e-5 * float(soft.abs().max()))
 
 
-def test_the_last_epoch_is_validated(scene, data):
+def test_the_last_epoch_is_validated(scene, data, tmp_path):
     validated = []
 
     class Spy(L.Callback):
         def on_validation_end(self, trainer, module):
             validated.append(trainer.current_epoch)
 
-    options = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    options |= {"accelerator": "cpu", "num_sanity_val_steps": 0}
-    trainer = L.Trainer(max_epochs=3, check_val_every_n_epoch=2, callbacks=[Spy()], **options)
-    trainer.fit(surrogate(scene), datamodule=data)
+    tutor = trainer(tmp_path, Spy(), max_epochs=3, check_val_every_n_epoch=2)
+    tutor.fit(surrogate(scene), datamodule=data)
     assert validated == [1, 2]
 
 
@@ -154,20 +152,6 @@ def test_scales_are_a_function_of_the_scene(make_scene, scene):
         assert float(ours) > 0
 
 
-def test_scales_do_not_depend_on_the_data(scene, batch, monkeypatch):
-    requested = []
-    original = type(scene.loads).sample
-
-    def watched(loads, seed, indices, **options):
-        requested.append(tuple(seed))
-        return original(loads, seed, indices, **options)
-
-    monkeypatch.setattr(type(scene.loads), "sample", watched)
-    sampled_solutions(scene)
-    assert requested
-    assert all(stream not in (0, 1, 2) for _, stream in requested)
-
-
 # ------------------------------------------------------------------ the schedule
 
 
@@ -204,7 +188,7 @@ def test_a_warmup_out_of_range_raises_an_error(warmup):
 # ------------------------------------------------------------------ training
 
 
-@pytest.mark.parametrize("loss", [MSE, LrStar, LrPlus])
+@pytest.mark.parametrize("loss", [MSE, LrPlus])
 def test_training_lowers_its_loss(scene, data, tmp_path, loss):
     module, train = surrogate(scene, loss(), lr=3e-3), data.samples("train")
 
@@ -270,10 +254,12 @@ def run(scene, folder, data, *, epochs=4, stop=None, resume=None, loss=LrPlus):
     return module, tutor
 
 
-@pytest.mark.parametrize("loss", [MSE, lambda: LrPlus(warmup_epochs=3)], ids=["mse", "lr_plus"])
-def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
-    scene, folder, data, tmp_path, loss
-):
+def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(scene, folder, data, tmp_path):
+    """The weight of the residual changes from epoch to epoch."""
+
+    def loss():
+        return LrPlus(warmup_epochs=3)
+
     def fresh():
         options = {"train": 12, "val": 4, "test": 4, "batch_size": 4, "workers": 0}
         return DataModule(scene, folder=str(folder), **options)
@@ -347,23 +333,14 @@ def generators():
 
 
 @pytest.mark.parametrize("ahead", [0, 1, 700])
-def test_random_numbers_continue_from_restored_states(generators, ahead):
+def test_random_numbers_continue_from_stored_states(generators, tmp_path, ahead):
     for _ in range(ahead):
         torch.rand(1), np.random.standard_normal(), random.gauss(0, 1)  # noqa: NPY002
-    states = random_states()
+    torch.save({"random": random_states()}, tmp_path / "states")
     first, second = draws(), draws()
     assert first != second
-    set_random_states(states)
-    assert [draws(), draws()] == [first, second]
-
-
-def test_random_states_can_be_read_with_weights_only(generators, tmp_path):
-    np.random.standard_normal(), random.gauss(0, 1)  # noqa: NPY002  # half of a pair is kept
-    torch.save({"random": random_states()}, tmp_path / "states")
-    expected = draws()
-    draws()
     set_random_states(torch.load(tmp_path / "states", weights_only=True)["random"])
-    assert draws() == expected
+    assert [draws(), draws()] == [first, second]
 
 
 def test_a_checkpoint_of_many_devices_is_resumed_on_one(generators):
