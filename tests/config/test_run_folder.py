@@ -237,7 +237,7 @@ def test_what_works_is_not_refused(compose, override):
 @pytest.mark.parametrize(
     "law",
     [
-        ["material=ogden_k2", "material.exponents=[5e-324,5.0,-2.0]"],
+        ["material=ogden_k2", "material.exponents=[1e-160,5.0,-2.0]"],
         ["material=yeoh_k2", "material.bulk=1e300", "+mesh.cell=tetra"],
     ],
 )

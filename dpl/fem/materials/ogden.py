@@ -33,7 +33,7 @@ class OgdenK2(Material):
 
     def check_constants(self) -> None:
         """Check that there are as many exponents as moduli, none 0, and that the body resists."""
-        if len(self.shear) != len(self.exponents) or not all(self.exponents):
+        if len(self.shear) != len(self.exponents) or not all(a * a for a in self.exponents):
             raise ValueError(
                 f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"
             )
