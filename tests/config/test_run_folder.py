@@ -234,15 +234,8 @@ def test_what_works_is_not_refused(compose, override):
     assert OmegaConf.to_yaml(cfg) == before, "a check changes nothing"
 
 
-@pytest.mark.parametrize(
-    "law",
-    [
-        ["material=ogden_k2", "material.exponents=[1e-160,5.0,-2.0]"],
-        ["material=yeoh_k2", "material.bulk=1e300", "+mesh.cell=tetra"],
-    ],
-)
-def test_a_body_whose_stiffness_is_no_matrix_is_refused(compose, tiny, law):
-    cfg = compose(*tiny, *law)
+def test_a_body_whose_stiffness_is_no_matrix_is_refused(compose, tiny):
+    cfg = compose(*tiny, "material=yeoh_k2", "material.bulk=1e300", "+mesh.cell=tetra")
     build.check(cfg)
     with pytest.raises(ConfigError, match=r"material, mesh, .*K\(0\) cannot be used"):
         build.build_scene(cfg)
