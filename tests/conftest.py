@@ -241,3 +241,19 @@ def script(monkeypatch, capfd) -> Callable[..., SimpleNamespace]:
         return SimpleNamespace(status=status, **capfd.readouterr()._asdict())
 
     return script
+
+
+@pytest.fixture(scope="session")
+def _home_of_run(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("trained")
+
+
+@pytest.fixture
+def trained_run(script, tiny_training, _home_of_run) -> Path:
+    """The folder of a training run of one epoch, made once; read it, do not write there."""
+    run = _home_of_run / "runs" / "first"
+    if not run.exists():
+        short = ["trainer.max_epochs=1", "run=runs/first"]
+        ended = script("train", *tiny_training, *short, cwd=_home_of_run)
+        assert ended.status == 0, ended.err[-2000:]
+    return run

@@ -12,13 +12,14 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save
+from set_files import content, flaws, lines
 
 from dpl import DataSetError
 from dpl.data import DataSet, Store, dataset
 from dpl.data.solving import worker_pool
 from dpl.data.solving.solve import LoadKey, failed_load, solve_load
 from dpl.data.storage import store as store_module
-from dpl.data.storage.integrity import repair, verify
+from dpl.data.storage.integrity import repair
 from dpl.data.storage.manifest import shard_name
 from dpl.data.storage.pending import PendingLoads
 from dpl.data.storage.shard import to_dense, to_sparse
@@ -27,14 +28,6 @@ from dpl.system.files import append_jsonl
 
 SIZES = {"train": 12, "val": 4, "test": 4}
 WANTED = {split: range(size) for split, size in SIZES.items()}
-
-
-@pytest.fixture
-def copy(data, tmp_path):
-    """A copy of the tiny data set that may be damaged."""
-    folder = tmp_path / "copy"
-    shutil.copytree(data.store.folder, folder)
-    return Store(folder, data.scene, data.store.seed)
 
 
 @pytest.fixture
@@ -76,18 +69,6 @@ def fill(store, missing=None, workers=0, **more):
     return len(list(writer(store, workers=workers).solve(missing.items(), **more)))
 
 
-def lines(store, name="manifest.jsonl"):
-    return [json.loads(line) for line in (store.folder / name).read_text().splitlines()]
-
-
-def content(store):
-    """Return all that must not depend on how the data set was made, byte for byte."""
-    folder = store.folder
-    return {
-        p.name: p.read_bytes() for p in [*folder.glob("*.safetensors"), *folder.glob("m*.jsonl")]
-    }
-
-
 def same(one, other):
     return all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
@@ -105,10 +86,6 @@ def rewrite(store, change, which=0):
     return path.name
 
 
-def flaws(store):
-    return {part.file: flaw for part, flaw in verify(store) if flaw}
-
-
 def mended(store):
     return [part.file for part, _ in repair(store)]
 
@@ -116,7 +93,7 @@ def mended(store):
 # ------------------------------------------------------------------ what is stored
 
 
-def test_stored_samples_meet_the_tolerance_and_invert_nothing(data, scene):
+def test_stored_samples_are_the_loads_of_their_stream_and_meet_the_tolerance(data, scene):
     for split, size in SIZES.items():
         sample = data.store.load(split, size)
         assert len(sample.force) == size
@@ -125,26 +102,15 @@ def test_stored_samples_meet_the_tolerance_and_invert_nothing(data, scene):
         assert ratio.max() < scene.solver.tol
         assert scene.problem.volume_ratio(sample.displacement).min() > 0
         assert not sample.displacement[:, ~scene.problem.free].any()
-
-
-def test_stored_samples_are_the_loads_of_their_stream_in_order(data, scene):
-    for split, size in SIZES.items():
         drawn = scene.loads.sample(data.store.stream(split), range(size))
-        assert torch.equal(data.store.load(split, size).force, drawn.force)
-        assert torch.equal(data.store.load(split, size).young, drawn.young)
+        assert torch.equal(sample.force, drawn.force)
+        assert torch.equal(sample.young, drawn.young)
 
 
-def test_the_first_samples_do_not_depend_on_how_many_there_are(data):
-    assert same(data.store.load("train", 5), [c[:5] for c in data.store.load("train", 12)])
-
-
-def test_the_modes_are_kept_with_the_data(data, scene):
+def test_the_data_set_carries_modes_fingerprint_seed_and_versions(data, scene):
     kept = data.store.modes()
     assert torch.equal(kept["values"], scene.loads.eigenmodes.values)
     assert torch.equal(kept["vectors"], scene.loads.eigenmodes.vectors)
-
-
-def test_the_data_set_carries_fingerprint_seed_and_versions(data, scene):
     card = json.loads((data.store.folder / "scene.json").read_text())
     assert card["fingerprint"] == scene.fingerprint
     assert card["scene"] == json.loads(json.dumps(scene.identity()))
@@ -207,19 +173,6 @@ def test_forces_are_restored_from_their_sparse_form(shape):
     assert packed["nodal_force"].abs().amax(dim=1).min() > 0, "nothing is stored of idle nodes"
 
 
-def test_an_empty_batch_of_forces_is_restored():
-    force = torch.zeros(0, 7, 3, dtype=torch.float64)
-    assert to_dense(to_sparse(force), (7, 3)).shape == (0, 7, 3)
-
-
-def test_shards_hold_forces_of_loaded_nodes_only(data):
-    shard = load_file(data.store.folder / lines(data.store)[0]["file"])
-    assert "force" not in shard
-    assert (
-        len(shard["node"]) < 0.8 * shard["displacement"].shape[0] * shard["displacement"].shape[1]
-    )
-
-
 def test_forces_that_every_load_holds_are_stored_and_verified(scene, make_scene, tmp_path):
     weight = torch.full(scene.problem.shape, 1e-7, dtype=torch.float64)
     weight[:, 1:] = 0.0
@@ -244,7 +197,7 @@ def test_samples_of_plane_bodies_are_stored(make_scene, tmp_path):
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_bytes_do_not_depend_on_the_number_of_workers(data, fresh, workers):
     fill(fresh, WANTED, workers=workers)
-    assert content(fresh) == content(data.store)
+    assert content(fresh.folder) == content(data.store.folder)
 
 
 def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fresh, monkeypatch):
@@ -253,23 +206,16 @@ def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fr
 
     monkeypatch.setattr(dataset, "solve_loads", backwards)
     fill(fresh, WANTED)
-    assert content(fresh) == content(data.store)
+    assert content(fresh.folder) == content(data.store.folder)
 
 
-@pytest.mark.parametrize("size", [1, 5])
-def test_the_samples_do_not_depend_on_the_size_of_shards(data, fresh, monkeypatch, size):
-    monkeypatch.setattr(store_module, "SHARD_SIZE", size)
+def test_the_samples_do_not_depend_on_the_size_of_shards(data, fresh, monkeypatch):
+    monkeypatch.setattr(store_module, "SHARD_SIZE", 5)
     fill(fresh, WANTED)
-    assert max(line["tried"] for line in lines(fresh)) == min(size, 12)
+    assert max(line["tried"] for line in lines(fresh)) == 5
     for split, count in SIZES.items():
         assert fresh.digest(split, count) == data.store.digest(split, count)
     assert flaws(fresh) == {}
-
-
-def test_nothing_in_the_manifest_depends_on_a_clock(copy):
-    known = {"file", "sha256", "split", "first", "tried", "accepted", "iterations", "amplitudes",
-             "rejected"}  # fmt: skip
-    assert all(set(line) == known for line in lines(copy))
 
 
 # ------------------------------------------------------------------ growing
@@ -278,14 +224,16 @@ def test_nothing_in_the_manifest_depends_on_a_clock(copy):
 def test_growing_solves_only_the_new_loads_and_gives_the_same_samples(data, fresh, solved):
     fill(fresh, {"train": range(5)})
     before = fresh.load("train", 5)
-    files = content(fresh)
+    files = content(fresh.folder)
     solved.clear()
     fill(fresh, {"train": fresh.missing("train", 12)})
     assert solved == [(0, 0, index) for index in range(5, 12)]
     assert same([column[:5] for column in fresh.load("train", 12)], before)
     assert fresh.missing("train", 12) == []
     assert fresh.digest("train", 12) == data.store.digest("train", 12)
-    assert all(content(fresh)[name] == was for name, was in files.items() if "manifest" not in name)
+    assert all(
+        content(fresh.folder)[name] == was for name, was in files.items() if "manifest" not in name
+    )
     assert [(line["first"], line["tried"]) for line in lines(fresh)] == [(0, 5), (5, 7)]
 
 
@@ -383,12 +331,6 @@ def test_a_body_of_another_size_shares_the_set_with_its_own_moduli(copy, make_sc
         assert len(mine.young.unique()) == size
 
 
-def test_a_data_set_of_another_seed_is_refused(copy):
-    other = Store(copy.folder, copy.scene, 1)
-    with pytest.raises(DataSetError, match=r"seed 0, not 1.*data\.seed"):
-        fill(other, WANTED)
-
-
 def test_a_folder_that_is_no_data_set_is_refused_and_not_changed(scene, tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
     store = Store(tmp_path, scene, 0)
@@ -412,34 +354,25 @@ def test_a_damaged_scene_file_is_refused_by_name(copy, harm):
         copy.shards()
 
 
-def test_a_data_set_of_another_scene_is_refused_by_key_with_both_values(copy):
-    card = json.loads((copy.folder / "scene.json").read_text())
-    card["fingerprint"], card["scene"]["loads"]["deflection"] = "0f" * 32, 0.3
+def test_values_of_another_scene_are_compared_by_key(copy):
+    """1 equals 1.0 even if the fingerprint differs."""
+    card, found = json.loads((copy.folder / "scene.json").read_text()), copy.shards()
+    card["fingerprint"], card["scene"]["degree"] = "0f" * 32, 1.0
+    (copy.folder / "scene.json").write_text(json.dumps(card))
+    assert copy.shards() == found
+    card["scene"]["loads"]["deflection"] = 0.3
     (copy.folder / "scene.json").write_text(json.dumps(card))
     with pytest.raises(DataSetError, match=r"\(loads\.deflection: 0\.3 there, 0\.4 here\)"):
         copy.shards()
 
 
-def test_numbers_of_the_scene_file_are_compared_by_value(copy):
-    """1 equals 1.0 even if the fingerprint differs."""
-    card = json.loads((copy.folder / "scene.json").read_text())
-    lines = copy.shards()
-    card["fingerprint"], card["scene"]["degree"] = "0f" * 32, 1.0
-    (copy.folder / "scene.json").write_text(json.dumps(card))
-    assert copy.shards() == lines
-
-
-@pytest.mark.parametrize("kind", ["file", "device"])
-def test_a_folder_that_is_a_file_is_refused_by_its_key(scene, tmp_path, kind):
-    path = Path("/dev/null") if kind == "device" else tmp_path / "file"
-    path.touch()
-    with pytest.raises(DataSetError, match=r"^data\.folder = .* must be a folder"):
-        Store(path, scene, 0).shards()
-
-
-def test_an_empty_split_is_refused(copy):
-    with pytest.raises(DataSetError, match="no test samples"):
-        copy.load("test", 0)
+def test_a_folder_of_another_seed_and_a_file_are_refused_by_their_key(copy, tmp_path):
+    with pytest.raises(DataSetError, match=r"seed 0, not 1.*data\.seed"):
+        fill(Store(copy.folder, copy.scene, 1), WANTED)
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file", Path("/dev/null")):
+        with pytest.raises(DataSetError, match=r"^data\.folder = .* must be a folder"):
+            Store(path, copy.scene, 0).shards()
 
 
 @pytest.mark.skipif(os.system("unshare -rm true 2>/dev/null") != 0, reason="needs unshare")
@@ -521,12 +454,12 @@ def another_point(shard):
     ],
 )
 def test_verify_finds_damaged_shards_whose_digest_is_right(data, copy, change):
-    before = content(data.store)
+    before = content(data.store.folder)
     name = rewrite(copy, change)
     assert list(flaws(copy)) == [name]
     assert mended(copy) == [name]
     fill(copy)
-    after = content(copy)
+    after = content(copy.folder)
     assert sorted(after.pop("manifest.jsonl").splitlines()) == sorted(
         before.pop("manifest.jsonl").splitlines()
     )
@@ -543,7 +476,7 @@ def test_an_invalid_line_of_the_manifest_is_solved_again(copy, data, harm):
     assert copy.summary()
     repair(copy)
     fill(copy)
-    assert content(copy) == content(data.store)
+    assert content(copy.folder) == content(data.store.folder)
 
 
 @pytest.mark.parametrize(
@@ -627,7 +560,7 @@ def test_a_file_outside_the_folder_is_not_read(copy):
 
 
 def test_repair_removes_files_that_no_manifest_names(copy):
-    before = content(copy)
+    before = content(copy.folder)
     stray = copy.folder / "train-000012.safetensors"
     stray.write_bytes(b"half a shard")
     part = copy.folder / ".val-000004.safetensors.99.part"
@@ -639,16 +572,7 @@ def test_repair_removes_files_that_no_manifest_names(copy):
     assert not stray.exists()
     assert not part.exists()
     assert (copy.folder / "notes.txt").exists()
-    assert content(copy) == before
-
-
-def test_a_line_torn_inside_its_reject_list_is_solved_again(hard, tmp_path):
-    store = Store(tmp_path / "d", hard, 0)
-    fill(store, {"train": range(6)})
-    manifest = store.folder / "manifest.jsonl"
-    line = manifest.read_text()
-    manifest.write_text(line[: line.index("}") + 1])  # ends like a whole line
-    assert store.missing("train", 6) == list(range(6))
+    assert content(copy.folder) == before
 
 
 # ------------------------------------------------------------------ reports
@@ -674,11 +598,3 @@ def test_the_time_per_load_is_the_mean_over_all_sessions(copy):
         append_jsonl(copy.folder / "journal.jsonl", line)
     assert copy.seconds_per_load() == pytest.approx(8.0 / 40)
     assert "0.800 s per load on one core, 8 s of wall time in 2 sessions" in copy.summary()
-
-
-def test_a_line_that_names_the_shard_of_another_split_is_ignored(copy, data):
-    first, other = (line for line in lines(copy) if line["first"] == 0 and line["split"] != "test")
-    line = other | {"split": first["split"]}
-    (copy.folder / "manifest.jsonl").write_text(json.dumps(line) + "\n")
-    assert not copy.tried("train") | copy.tried("val")
-    assert "manifest.jsonl" in flaws(copy)

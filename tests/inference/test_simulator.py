@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import shutil
 import warnings
 from fractions import Fraction
 from functools import partial
@@ -15,7 +16,7 @@ import dpl
 import dpl.inference.request as request_module
 import dpl.inference.simulator as simulator_module
 from dpl.config import build
-from dpl.fem import Status, SubspaceNewton, estimate_error, solve
+from dpl.fem import Status, SubspaceNewton, solve
 from dpl.inference import Hybrid, Simulator
 from dpl.models import CNN, FCNN, GNN
 from dpl.training import MSE, Surrogate
@@ -183,14 +184,6 @@ def test_a_step_that_makes_an_answer_worse_is_not_taken(scene, forces, truth):
     assert sim(forces, tol=1e-6).converged.all()
 
 
-@pytest.mark.parametrize(("option", "value"), [("error", 0.0), ("error", -1), ("error", math.nan)])
-def test_an_error_is_above_zero(scene, forces, option, value):
-    with pytest.raises(ValueError, match=f"{option} = .* must be above 0"):
-        simulator_of(scene)(forces, **{option: value})
-    with pytest.raises(ValueError, match="steps = -1 must be 0 or more"):
-        simulator_of(scene, steps=-1)
-
-
 @pytest.fixture
 def clock(monkeypatch):
     """A clock that goes on by a millisecond whenever the simulator reads it."""
@@ -206,7 +199,7 @@ def test_a_budget_ends_it_and_the_best_so_far_is_returned(scene, forces, clock):
     whole = sim(forces[0], tol=1e-10)
     assert whole.converged
     found = []
-    for budget in range(1, 80, 2):
+    for budget in range(1, 80, 6):
         answer = simulator_of(scene)(forces[0], tol=1e-10, budget_ms=budget)
         found.append(answer)
         # the prediction is always given; each reading of the clock takes 1 ms, two for an estimate
@@ -294,20 +287,6 @@ def test_the_last_answer_starts_the_next_where_it_is_nearer(scene, forces, truth
     assert not torch.equal(again.displacement, first.displacement)
 
 
-def test_the_smallest_correction_is_not_that_of_the_smallest_residual(scene, loads):
-    load = loads.unbatch()[0]
-    exact = solve(scene.solver, load).displacement
-    noise = torch.randn(exact.shape, generator=torch.Generator().manual_seed(0)).double()
-    rough = exact + 1e-5 * torch.where(scene.problem.free, noise, 0.0)
-    guesses = [0.9 * exact, rough, torch.full_like(exact, torch.nan), -exact]
-    errors = [estimate_error(scene.linear, load, guess, products=0).error for guess in guesses]
-    assert errors.index(min(errors)) == 1
-    residuals = [
-        float(scene.problem.relative_residual(u, load.force)) for u in (rough, 0.9 * exact)
-    ]
-    assert min(residuals) > 0
-
-
 def test_forces_on_held_nodes_change_nothing(scene, forces):
     """Programs export reactions with the loads; 1e10 N on a clamp are nothing either."""
     held = ~scene.problem.free
@@ -372,8 +351,7 @@ def test_a_network_is_not_told_of_forces_on_held_nodes(make_scene, network):
         assert torch.equal(scaled, load.force / surrogate.predictor.force_scale)
 
 
-@pytest.mark.parametrize("size", [1e-100, 1e-158, 1e-200, 1e-280])
-@pytest.mark.parametrize("tol", [1e-6, 1e-12])
+@pytest.mark.parametrize(("size", "tol"), [(1e-158, 1e-6), (1e-280, 1e-12)])
 def test_tiny_forces_are_answered_as_small_ones_are(scene, forces, size, tol):
     """Their squares are 0 in float64, and so was once ||R|| / ||f||."""
     linear = scene.length * scene.linear.solve(forces[0] / (E * scene.force_unit))
@@ -388,23 +366,11 @@ def test_tiny_forces_are_answered_as_small_ones_are(scene, forces, size, tol):
     assert torch.allclose(stiff.displacement / size, linear, rtol=1e-9, atol=0)
 
 
-@pytest.mark.parametrize("size", [1e100, 1e158, 1e200, 1e290])
-def test_huge_forces_are_never_in_balance(scene, forces, size):
-    for tol in (None, 1e-6):
-        answer = simulator_of(scene, lambda load: 0 * load.force)(size * forces[0], tol=tol)
-        assert not answer.converged
-        assert answer.residual == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(
-    ("size", "young"),
-    [(1e-300, E), (5e-324, E), (1.0, 1e300), (1.0, 1e308), (1e300, 1e-300), (1.0, 5e-324)],
-)
-def test_forces_that_float64_cannot_hold_over_the_modulus_are_refused(scene, size, young):
-    force = size * scene.problem.free.double()
-    with pytest.raises(ValueError, match="force: its largest entry over E L\\^2 must be 0"):
-        simulator_of(scene)(force, young=young, tol=1e-6)
-    assert simulator_of(scene)(0 * force, young=young).method == "rest"
+@pytest.mark.parametrize(("size", "tol"), [(1e158, None), (1e290, 1e-6)])
+def test_huge_forces_are_never_in_balance(scene, forces, size, tol):
+    answer = simulator_of(scene, lambda load: 0 * load.force)(size * forces[0], tol=tol)
+    assert not answer.converged
+    assert answer.residual == pytest.approx(1.0)
 
 
 def test_a_tolerance_that_rounding_does_not_allow_is_said_not_to_be_kept(scene, forces, truth):
@@ -480,7 +446,7 @@ def test_a_modulus_is_any_real_number(scene, forces, value):
         assert torch.equal(found.displacement, wanted.displacement)
 
 
-@pytest.mark.parametrize("value", [1e-3, np.float32(1e-3), np.array(1e-3), torch.tensor(1e-3)])
+@pytest.mark.parametrize("value", [np.float32(1e-3), np.array(1e-3), torch.tensor(1e-3)])
 def test_a_tolerance_is_any_real_number(scene, forces, value):
     answer = simulator_of(scene)(forces[0], tol=value, budget_ms=1e9 * value)
     assert answer.converged
@@ -510,38 +476,39 @@ ABSURD = {
 }
 
 
-@pytest.mark.parametrize("name", ["force", "young", "tol", "budget_ms"])
 @pytest.mark.parametrize("kind", ABSURD)
-def test_what_is_no_real_number_is_refused_in_a_line_that_names_it(scene, forces, name, kind):
-    requested = {"force": forces[0].numpy(), name: ABSURD[kind]}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        with pytest.raises(ValueError, match=f"^{name}") as caught:
-            simulator_of(scene)(**requested)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 300
+def test_what_is_no_real_number_is_refused_in_a_line_that_names_it(scene, forces, kind):
+    sim = simulator_of(scene)
+    for name in ("force", "young", "tol", "budget_ms"):
+        requested = {"force": forces[0].numpy(), name: ABSURD[kind]}
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            with pytest.raises(ValueError, match=f"^{name}") as caught:
+                sim(**requested)
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 300
 
 
-@pytest.mark.parametrize("kind", ["complex", "bool", "text", "masked", "meta", "sparse", "gap"])
-def test_forces_of_the_right_shape_that_are_no_real_numbers_are_refused(scene, forces, kind):
-    array = forces[0].numpy()
-    given = {
-        "complex": array + 1j,
-        "bool": array > 0,
-        "text": array.astype(str),
-        "masked": np.ma.masked_array(array, array > 0),
-        "meta": forces[0].to("meta"),
-        "sparse": forces[0].to_sparse(),
-        "gap": [row[:-1] if k == 3 else row for k, row in enumerate(array.tolist())],
-    }[kind]
-    with pytest.raises(ValueError, match=r"^force must be real numbers") as caught:
-        simulator_of(scene)(given)
-    assert "\n" not in str(caught.value)
-
-
-def test_of_rows_of_unequal_lengths_it_is_said_what_is_wrong(scene):
-    with pytest.raises(ValueError, match=r"force must be real numbers; .*inhomogeneous"):
-        simulator_of(scene)([[1.0, 2.0, 3.0], [1.0]])
+def test_forces_that_are_refused(scene, forces):
+    """Of the right shape, and no real numbers; not finite; or beyond float64 over the modulus."""
+    sim, array, free = simulator_of(scene), forces[0].numpy(), scene.problem.free
+    gap = [row[:-1] if k == 3 else row for k, row in enumerate(array.tolist())]
+    no_numbers = [array + 1j, array > 0, array.astype(str), np.ma.masked_array(array, array > 0)]
+    words = r"^force must be real numbers"
+    refused = [(force, E, words) for force in (*no_numbers, forces[0].to("meta"), gap)]
+    refused.append((forces[0].to_sparse(), E, words))
+    refused.append(([[1.0, 2.0, 3.0], [1.0]], E, words + "; .*inhomogeneous"))
+    for bad in (math.nan, math.inf):
+        refused.append((torch.where(free, forces[0], bad), E, "force: a number is not finite"))
+    extremes = [(1e-300, E), (5e-324, E), (1.0, 1e300), (1.0, 1e308), (1e300, 1e-300)]
+    for size, young in (*extremes, (1.0, 5e-324)):
+        words = r"force: its largest entry over E L\^2 must be 0"
+        refused.append((size * free.double(), young, words))
+        assert sim(0 * forces[0], young=young).method == "rest"
+    for force, young, words in refused:
+        with pytest.raises(ValueError, match=words) as caught:
+            sim(force, young=young)
+        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("ratio", [-1.0, -1.5, 0.5, 0.7])
@@ -559,19 +526,13 @@ def test_a_poisson_ratio_that_no_solid_has_is_refused(make_scene, ratio):
         assert sim(force, parameters=[[inside]]).out_of_distribution == (inside != 0.3)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_force_that_is_not_finite_on_a_held_node_is_refused(scene, forces, bad):
-    force = torch.where(scene.problem.free, forces[0], bad)
-    with pytest.raises(ValueError, match="force: a number is not finite"):
-        simulator_of(scene)(force)
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ({"force": np.zeros((3, 3))}, "force: its shape is"),
         ({"force": np.zeros(7)}, "force: its shape is"),
         ({"force": None}, "force"),
+        *(({"error": value}, "error = .* must be above 0") for value in (0.0, -1, math.nan)),
         ({"tol": 0.0}, "tol = 0.0"),
         ({"tol": math.nan}, "tol = nan"),
         ({"tol": 1.0}, "tol = 1.0 must be at least 1e-15 and below 1"),
@@ -604,24 +565,25 @@ def test_a_range_of_moduli_wants_to_know_which(make_scene):
     force = torch.zeros(scene.problem.shape, dtype=torch.float64)
     with pytest.raises(ValueError, match="young: the scene has a range"):
         simulator_of(scene)(force)
+    with pytest.raises(ValueError, match="steps = -1 must be 0 or more"):
+        simulator_of(scene, steps=-1)
     assert simulator_of(scene)(force, young=1e12).method == "rest"
 
 
-def test_a_trained_run_becomes_a_simulator(script, tiny_training, tmp_path):
-    ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/a", cwd=tmp_path)
-    assert ended.status == 0, ended.err[-2000:]
-    sim = dpl.load(tmp_path / "runs" / "a")
+def test_a_trained_run_becomes_a_simulator(trained_run, tmp_path):
+    run = shutil.copytree(trained_run, tmp_path / "run")
+    sim = dpl.load(run)
     force = sim.scene.loads.sample((0, 9), [0]).force[0] * sim.scene.force_unit * E
     answer = sim(force, tol=1e-6)
     assert answer.converged
     assert answer.method in ("hybrid", "full Newton")
-    config = tmp_path / "runs" / "a" / "config.yaml"
+    config = run / "config.yaml"
     config.write_text(config.read_text().replace("poisson: 0.3", "poisson: 0.35"))
     with pytest.raises(build.ConfigError, match=r"law\.poisson: 0\.3 there, 0\.35 here"):
-        dpl.load(tmp_path / "runs" / "a")
+        dpl.load(run)
     config.write_text(config.read_text().replace("- 5\n  - 3\n  - 3", "- 6\n  - 3\n  - 3"))
     with pytest.raises(build.ConfigError):
-        dpl.load(tmp_path / "runs" / "a")
+        dpl.load(run)
 
 
 def test_the_corrector_is_the_solver_with_the_same_stiffness(scene):

@@ -19,7 +19,7 @@ from dpl.fem.symmetry import SymmetryGroup
 from dpl.inference import Simulator
 from dpl.models import Unrolled
 from dpl.models.unrolled.correction import choose_newton
-from dpl.models.unrolled.features import cell_gradients, rotated_strain, rotation, unbalanced_stress
+from dpl.models.unrolled.features import rotated_strain, unbalanced_stress
 from dpl.models.unrolled.fit import modes_of_parity
 from dpl.models.unrolled.regression import MapParities, Rows, fit_map, weighted_error
 from dpl.scene import Sample, Scene
@@ -190,7 +190,9 @@ def test_numbers_out_of_range_are_refused(beam, wrong):
         Unrolled(beam, **wrong)
 
 
-def test_a_run_is_trained_and_loaded(script, tiny_training, tmp_path):
+def test_a_run_is_trained_and_loaded_and_neither_resumed_nor_fitted_to_a_stream(
+    script, tiny_training, tmp_path
+):
     folder = tmp_path / "run"
     options = [one for one in tiny_training if not one.startswith("model.")]
     done = script("train", "model=unrolled", *options, f"run={folder}", cwd=tmp_path)
@@ -201,16 +203,11 @@ def test_a_run_is_trained_and_loaded(script, tiny_training, tmp_path):
     answer = simulator(**scene.si_inputs(load))
     assert answer.volume_ratio > 0
     assert simulator.surrogate.net.is_fitted
-
-
-def test_it_is_neither_resumed_nor_fitted_to_a_stream(script, tiny, tmp_path):
-    sizes = ["data.val=4", "data.test=4", "data.workers=0"]
-    run = ["model=unrolled", *tiny, f"run={tmp_path / 'run'}"]
-    assert not script("train", *run, *sizes, "data.train=16", cwd=tmp_path).status
-    resumed = script("train", f"run={tmp_path / 'run'}", "ckpt_path=last", cwd=tmp_path)
+    resumed = script("train", f"run={folder}", "ckpt_path=last", cwd=tmp_path)
     assert resumed.status
     assert "ckpt_path: Unrolled is fitted in one step and cannot be resumed" in resumed.err
-    stream = script("train", *run[:-1], "data=online", f"run={tmp_path / 'b'}", cwd=tmp_path)
+    options = [one for one in options if not one.startswith("data.train")]
+    stream = script("train", "model=unrolled", "data=online", *options, "run=b", cwd=tmp_path)
     assert stream.status
     assert "data: Unrolled is fitted to solved loads; set data=offline" in stream.err
 
@@ -227,14 +224,6 @@ def test_rotated_strain_is_the_polar_form():
     assert (rotated_strain(H) - expected).abs().max() < 1e-9
     small = rotated_strain(1e-9 * H)
     assert (small / 1e-18 - (W @ W / 2 + W @ e)).abs().max() < 1e-6
-
-
-def test_rotation_is_the_polar_factor():
-    random = torch.Generator().manual_seed(0)
-    H = 0.3 * torch.randn(50, 3, 3, generator=random).double()
-    H = H[torch.linalg.det(H + torch.eye(3)) > 0.2]
-    U, _, V = torch.linalg.svd(H + torch.eye(3))
-    assert (rotation(H) - U @ V).abs().max() < 1e-2
 
 
 @pytest.mark.parametrize("name", [*ISOTROPIC, "guccione"])  # others: no stress in compression
@@ -259,21 +248,6 @@ def test_reduced_stiffness_is_that_of_any_law_of_a_range(beam):
         assert torch.allclose(inverse @ exact, torch.eye(5).double(), atol=1e-10)
         expected = torch.linalg.solve(exact, right.T).T
         assert (reduced.solve(factors, right) - expected).norm() < 1e-10 * expected.norm()
-
-
-def test_cell_gradients_of_a_linear_field(beam):
-    H = torch.randn(3, 3).double()
-    field = beam.problem.points @ H.T
-    assert (cell_gradients(beam.problem, field[None]) - H).abs().max() < 1e-12
-
-
-def test_ridge_regression_finds_an_exact_map():
-    random = torch.Generator().manual_seed(0)
-    features = torch.randn(60, 2, 1, 3, 3, generator=random).double()
-    matrix = torch.randn(18, 4, generator=random).double()
-    rows = Rows(features, features.flatten(1) @ matrix, torch.ones(60).double())
-    found = fit_map(rows, rows, no_symmetry())
-    assert (found.matrix - matrix).abs().max() < 1e-8
 
 
 def no_symmetry():
