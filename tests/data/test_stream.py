@@ -239,12 +239,12 @@ def counted(stream, batches):
 )
 def test_no_sample_is_used_more_than_reuse_times(replay, reuse, new_per_round, capacity):
     stream = replay(reuse=reuse, batches=1, new_per_round=new_per_round, capacity=capacity)
-    used = counted(stream, 300 if reuse > 1 else 60)
+    used = counted(stream, 100 if reuse > 1 else 60)
     assert used.max() <= reuse
     assert reuse > 1 or (used[:-5] == 1).all(), "none is lost"
 
 
-@pytest.mark.parametrize("reuse", [2, 6, 50])
+@pytest.mark.parametrize("reuse", [2, 50])
 def test_samples_are_used_half_as_often_while_the_buffer_fills(replay, reuse):
     stream = replay(reuse=reuse, batches=1, capacity=10_000)
     for drawn in range(1, 200):
@@ -253,20 +253,20 @@ def test_samples_are_used_half_as_often_while_the_buffer_fills(replay, reuse):
         assert (stream.produced - 4) * reuse / 2 < drawn * 8, "none is taken before it is needed"
 
 
-@pytest.mark.parametrize("reuse", [2, 6, 50])
+@pytest.mark.parametrize("reuse", [2, 50])
 def test_samples_are_used_reuse_times_on_average_once_the_buffer_is_full(replay, reuse):
     stream = replay(reuse=reuse, batches=1, capacity=64)
     while stream.produced <= 64:
         next(iter(stream))
     produced, used = stream.produced, 0
-    for _ in range(100 * reuse):
+    for _ in range(20 * reuse):
         used += len(next(iter(stream)).young)
     assert used == pytest.approx((stream.produced - produced) * reuse, abs=4 * reuse + 8)
 
 
 def test_no_sample_is_twice_in_a_batch_if_there_are_enough(replay):
     stream = replay(batches=1, new_per_round=8, reuse=4, capacity=64, batch_size=8)
-    for _ in range(300):
+    for _ in range(100):
         assert len(set(places(next(iter(stream))))) == 8
 
 
@@ -292,11 +292,11 @@ def test_all_samples_of_the_buffer_are_drawn(replay):
     assert counts.min() > 20  # 800 draws from 16
 
 
-@pytest.mark.parametrize("reuse", [4, 50])
+@pytest.mark.parametrize("reuse", [4, 20])
 def test_batches_stay_mixed_however_long_it_runs(replay, reuse):
     """A batch holds old and new samples."""
     stream = replay(capacity=256, new_per_round=8, reuse=reuse, batch_size=32, batches=1)
-    for _ in range(60 * reuse):
+    for _ in range(40 * reuse):
         batch = next(iter(stream))
     ages = []
     for _ in range(40):
@@ -340,15 +340,6 @@ def test_memory_does_not_grow_beyond_the_buffer(replay):
     assert stream.produced > 6000
     assert resident() - before < 8, "MB; all that went through is 30 MB"
     assert [column.data_ptr() for column in stream._buffer.sample] == columns
-
-
-def test_new_samples_do_not_change_earlier_batches(replay):
-    stream = replay(capacity=8, new_per_round=8, reuse=1, batches=1)
-    batch = next(iter(stream))
-    before = batch.force.clone()
-    for _ in range(5):
-        next(iter(stream))
-    assert torch.equal(batch.force, before)
 
 
 # ------------------------------------------------------------------ rates

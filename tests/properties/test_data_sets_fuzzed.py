@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -35,14 +36,6 @@ FILES = [
 REMEDIES = ("action=repair", "data.folder", "data.seed", "remove", "generate")
 
 
-class Sound:
-    """Folder and samples of an undamaged data set."""
-
-    def __init__(self, folder: Path, samples: dict) -> None:
-        """Store folder and samples."""
-        self.folder, self.samples = folder, samples
-
-
 @pytest.fixture(scope="module")
 def sound(scene, tmp_path_factory):
     """A data set of five shards and two pending loads, and its samples."""
@@ -62,7 +55,7 @@ def sound(scene, tmp_path_factory):
         if path.is_file() and not path.name.startswith(".")
     )
     whole = shutil.copytree(folder, folder.with_name("whole"))
-    return Sound(folder, samples(scene, whole))
+    return SimpleNamespace(folder=folder, samples=samples(scene, whole))
 
 
 @contextmanager

@@ -17,7 +17,7 @@ import skfem
 from hypothesis import given
 from hypothesis import strategies as st
 from skfem.io.meshio import to_meshio
-from tried import counted
+from tried import at_most, counted
 
 from dpl.fem import box, read_mesh, rectangle
 from dpl.fem.mesh import check_mesh, sandbox
@@ -195,6 +195,7 @@ def sound(mesh: skfem.Mesh) -> bool:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@at_most(0.5)
 @given(cell=st.sampled_from(list(BODIES)), changes=st.lists(CHANGES, min_size=1, max_size=3))
 @counted
 def test_a_damaged_file_is_an_error_in_one_line_or_a_sound_mesh(

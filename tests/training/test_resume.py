@@ -6,6 +6,7 @@ random time. The temporary folder is on another file system.
 
 import hashlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -218,7 +219,10 @@ LIMITED = textwrap.dedent(
 )
 
 
-@pytest.mark.parametrize(("name", "most"), [("best.safetensors", 0), ("last.ckpt", 50_000)])
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [pytest.param("best.safetensors", 0, marks=pytest.mark.slow), ("last.ckpt", 50_000)],
+)
 def test_a_full_disk_ends_training_with_one_line_and_intact_files(
     straight, environment, overrides, home, name, most
 ):
@@ -276,35 +280,27 @@ def test_digests_detect_a_single_bit(straight):
     assert digest(other) != digest(weights)
 
 
+@pytest.mark.parametrize("net", ["noisy", pytest.param("fcnn", marks=pytest.mark.slow)])
 def test_a_run_killed_in_a_step_ends_bit_for_bit_like_an_uninterrupted_one(
-    straight, killed, script, overrides, home
+    straight, killed, script, overrides, home, net
 ):
-    folder = killed("step", "fcnn", "step", 7)  # the second of epoch 3
+    """The run is resumed with its command line, and without it."""
+    name, alone = f"step-{net}", f"alone-{net}"
+    folder = killed(name, net, "step", 7)  # the second of epoch 3
     assert last(folder)["epoch"] == 2
-    run = script("train", *overrides("step", "fcnn"), "ckpt_path=last", cwd=home)
+    shutil.copytree(folder, home / alone)
+    quiet = "callbacks.progress_bar._target_=lightning.pytorch.callbacks.TQDMProgressBar"
+    own = ["trust=true"] if net == "noisy" else []  # a network of the user
+    run = script("train", f"run={alone}", "ckpt_path=last", quiet, *own, cwd=home)
+    assert run.status == 0, run.err
+    assert_same(straight(net), last(home / alone))
+    run = script("train", *overrides(name, net), "ckpt_path=last", cwd=home)
     assert run.status == 0, run.err
     assert "not solved again" in run.out
-    assert_same(straight("fcnn"), last(folder))
-    best = [read(home / name / "checkpoints/best.safetensors") for name in ("fcnn", "step")]
+    assert_same(straight(net), last(folder))
+    best = [read(home / name / "checkpoints/best.safetensors") for name in (net, name)]
     assert best[0]["epoch"] == best[1]["epoch"]
     assert digest(best[0]["state_dict"]) == digest(best[1]["state_dict"])
-
-
-def test_a_killed_run_is_resumed_without_repeating_its_command_line(straight, killed, script, home):
-    folder = killed("alone", "fcnn", "step", 7)
-    quiet = "callbacks.progress_bar._target_=lightning.pytorch.callbacks.TQDMProgressBar"
-    run = script("train", "run=alone", "ckpt_path=last", quiet, cwd=home)
-    assert run.status == 0, run.err
-    assert_same(straight("fcnn"), last(folder))
-
-
-def test_a_killed_run_of_a_network_with_dropout_ends_bit_for_bit_the_same(
-    straight, killed, script, overrides, home
-):
-    folder = killed("noise", "noisy", "step", 7)
-    assert last(folder)["epoch"] == 2
-    assert script("train", *overrides("noise", "noisy"), "ckpt_path=last", cwd=home).status == 0
-    assert_same(straight("noisy"), last(folder))
 
 
 @pytest.mark.slow
