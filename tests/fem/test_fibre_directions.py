@@ -150,6 +150,7 @@ def test_data_are_arrays_with_a_row_for_each_cell():
             frames_on(fem.FibreData(wrong), mesh)
 
 
+@pytest.mark.usefixtures("in_process")
 @pytest.mark.filterwarnings("ignore:.*inside out")
 def test_data_may_be_named_fields_of_a_mesh_file(tmp_path):
     """The rows are those of the cells that are kept, in their order."""

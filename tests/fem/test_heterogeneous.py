@@ -266,6 +266,7 @@ def test_an_error_names_the_part_of_the_law_that_does_not_fit_the_body(key):
         fem.Problem.build(grid(), MISFITS[key], regions=LEFT)
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_field_may_be_cell_data_of_a_mesh_file(tmp_path):
     """In the order of the cells that are read."""
     file, made = str(tmp_path / "body.vtu"), grid()

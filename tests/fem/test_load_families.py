@@ -152,7 +152,8 @@ def test_own_loads_are_in_range_and_doubled_ones_are_larger(build, linear, name)
 
 def placed(loads, force):
     """Return the words of `RangeCheck` for forces (B, N, D)."""
-    surrogate = SimpleNamespace(scene=SimpleNamespace(loads=loads), net=None)
+    predictor = SimpleNamespace(reads_young=False)
+    surrogate = SimpleNamespace(scene=SimpleNamespace(loads=loads), predictor=predictor)
     load = loads.sample(0, [0] * len(force))._replace(force=force)
     place = RangeCheck.of(surrogate, load)
     found = zip(place.outside.tolist(), place.is_known.tolist(), strict=True)

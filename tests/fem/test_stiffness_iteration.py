@@ -80,7 +80,7 @@ def test_condition_numbers_are_at_most_their_bounds(terms):
 
 
 def test_matrices_of_the_terms_sum_up_to_the_stiffness_of_each_parity(terms):
-    body, random = terms.problem.generic, np.random.default_rng(0)
+    body, random = terms.problem.reference, np.random.default_rng(0)
     form, iteration = OrbitForm.of(body, fem.symmetries(body)), StiffnessIteration.of_terms(terms)
     matrices = TermMatrices.of(terms, form, iteration)
     factors = np.append(terms.factors(body.material)[0].numpy(), 1.0)
@@ -174,7 +174,7 @@ def test_stiffness_is_the_sum_of_its_terms(grid, name):
     problem = fem.Problem.build(grid("hexahedron"), laws, regions=REGION, fixed=held)
     terms = StiffnessTerms.of(problem)
     assert len(terms) == count
-    body = problem.generic
+    body = problem.reference
     parts = [one.stiffness_at_rest() for one in terms.bodies]
     found = (terms.factors(body.material)[0, :, None] * torch.stack(parts)).sum(dim=0)
     expected = body.stiffness_at_rest()

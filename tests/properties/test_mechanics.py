@@ -27,7 +27,6 @@ from tried import at_most, counted
 
 from dpl import fem
 from dpl.fem.linear import full_matrix
-from dpl.fem.loads import body_force, traction
 from dpl.fem.solvers import concatenate
 
 # Very thin, nearly incompressible cells: said in words, and answers are held to what it says.
@@ -209,31 +208,6 @@ def test_motions_that_are_named_loose_are_those_that_cost_nothing(body, seed, he
     assert len(problem.unconstrained_rigid_body_modes()) == (values < 1e-10 * values[-1]).sum()
 
 
-@given(body=bodies(FREE), value=st.lists(st.floats(-10, 10), min_size=3, max_size=3))
-@counted
-def test_spread_loads_have_their_sum_and_their_moment(body, value):
-    """Of a traction on the end x = 1, and of a force per volume, as far as cells are straight."""
-    problem = body.build()
-    value, unit = np.array(value[: body.dim]), body.size / problem.length
-    sides = np.array(body.sides) * unit
-
-    def field(x):
-        return np.multiply.outer(value, np.ones(x.shape[1:]))
-
-    end = traction(problem, body.face(0, "max"), field, problem.length)
-    whole = body_force(problem, field)
-    middle = np.where(np.arange(body.dim) == 0, 2, 1) * sides / 2
-    for force, size, centre in (
-        (end, sides[1:].prod(), middle),
-        (whole, sides.prod(), sides / 2),
-    ):
-        total = torch.from_numpy(size * value)
-        assert (force.sum(dim=0) - total).norm() <= 1e-12 * total.norm() + 1e-300
-        place = torch.from_numpy(body.rotation @ centre + unit * body.origin)
-        moment = turning(problem.points + torch.from_numpy(problem.origin) - place, force)
-        assert moment.norm() <= 1e-11 * total.norm() * (1 + body.shift)
-
-
 # ---------------------------------------------------------------- the linear solution
 
 
@@ -278,6 +252,7 @@ def test_modes_are_the_lowest_eigenvectors(body, count):
     K = stiffness(problem, torch.zeros(1, *problem.shape, dtype=torch.float64))
     exact = np.linalg.eigvalsh(K)
     assert np.abs(values.numpy() - exact[: len(values)]).max() <= 1e-10 * exact[-1]
+    assert not vectors[~problem.free].any()
     V = vectors[problem.free].numpy()
     assert np.abs(V.T @ V - np.eye(V.shape[1])).max() <= 1e-9
     assert np.linalg.norm(K @ V - V * values.numpy(), axis=0).max() <= 1e-9 * exact[-1]
@@ -325,7 +300,6 @@ def check_states(newton: fem.Newton, load: fem.Load, states: list[fem.Solution])
         assert not u.any()
 
 
-@at_most(2)
 @given(case=cases(), mixed=st.booleans(), budget=st.sampled_from([1, 5, 60]))
 @counted
 def test_states_of_newton_are_not_inverted_and_say_what_they_are(case, mixed, budget):
@@ -376,7 +350,6 @@ def test_answer_is_in_balance_as_a_whole(case):
     assert turning(points, total).norm() <= 2 * allowed * points.norm(dim=1).max()
 
 
-@at_most(2)
 @given(case=cases(low=1e-2, high=3.0))
 @counted
 def test_answer_that_counts_as_stable_is_a_minimum(case):
@@ -548,63 +521,3 @@ def test_images_of_an_answer_answer_the_images_of_its_load(case):
         # where a cell is nearly flat, rounding of det F counts by its inverse
         allowed = 10 * slack(problem, image) / answer.volume_ratio.clamp(max=1.0)
         assert (found - residual).norm() <= allowed + 1e-10 * found.norm()
-
-
-# ---------------------------------------------------------------- broken input
-
-
-@given(
-    case=cases(low=1e-9, high=0.1),
-    what=st.sampled_from(["float32", "int", "no batch", "nodes", "axes", "none"]),
-)
-@counted
-def test_force_of_another_kind_or_shape_is_an_error_in_words(case, what):
-    body, push = case
-    newton = fem.Newton(body.build())
-    force = push.on(body, newton.linear_solver).force
-    wrong = {
-        "float32": force.float(),
-        "int": force.long(),
-        "no batch": force[0],
-        "nodes": force[:, :-1],
-        "axes": force[..., :-1],
-        "none": force[:0],
-    }[what]
-    load = fem.Load(wrong, torch.ones(len(wrong), dtype=torch.float64))
-    for solver in (newton, newton.linear_solver):
-        with pytest.raises(ValueError, match="force"):
-            fem.solve(solver, load)
-
-
-@at_most(0.5)
-@given(
-    case=cases(low=1e-9, high=0.1),
-    number=st.sampled_from([math.nan, math.inf, -math.inf]),
-    place=st.floats(0, 1, exclude_max=True),
-)
-@counted
-def test_force_that_is_no_number_is_in_balance_with_nothing(case, number, place):
-    """On held nodes too, where no displacement feels it."""
-    body, push = case
-    newton = fem.Newton(body.build(), max_total_iter=30)
-    load = push.on(body, newton.linear_solver)
-    load.force.view(-1)[int(place * load.force.numel())] = number
-    for solver in (newton, newton.linear_solver):
-        answer = fem.solve(solver, load)
-        assert not answer.converged.any()
-        assert not answer.residual.isfinite().any()
-
-
-@given(body=bodies((*HELD, "free")), steepness=steepnesses, seed=seeds)
-@counted
-def test_displacement_in_single_precision_is_answered_in_double_or_refused(body, steepness, seed):
-    problem = body.build()
-    u = bent(problem, steepness, seed).float()
-    expected = problem.evaluate(u.double())
-    try:
-        found = problem.evaluate(u)
-    except ValueError as error:
-        assert "float64" in str(error)  # noqa: PT017
-    else:
-        assert found.internal.dtype == torch.float64
-        assert (found.internal - expected.internal).norm() <= slack(problem, u.double())
