@@ -9,8 +9,8 @@ from omegaconf import DictConfig, OmegaConf
 from benchmarks import loss_table, paper_tables, subcommands
 from benchmarks.paper_tables import Result
 from benchmarks.study import record
+from benchmarks.tables import read
 from dpl import config
-from dpl.evaluation.tables import read
 
 EXPERIMENTS = ("beam_svk", "propeller_nh", "beam_nh_loss", "beam_young", "beam_young_wide")
 OF_CONVERGENCE = "beam_svk"  # experiment whose networks start Newton's method in experiment 4

@@ -55,9 +55,6 @@ def pod_galerkin(scene: Scene, train: Sample, *, rank: int, tolerance: float) ->
         train: Training samples.
         rank: Number of modes of the nonlinear part of displacements.
         tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
-
-    Raises:
-        ValueError: A number is out of range.
     """
     start = time.perf_counter()
     solver = PODGalerkin.fit(
@@ -89,9 +86,6 @@ def corrected(
         rank: Number of modes of the correction; a model which `HasCorrection` has chosen it.
         tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
         steps: Number of iterations, see `SubspaceNewton`.
-
-    Raises:
-        ValueError: A number is out of range.
     """
     start = time.perf_counter()
     if (solver := surrogate.predictor.correction()) is None:

@@ -10,9 +10,9 @@ from torch import Tensor
 from benchmarks.methods import Method
 from benchmarks.samples import solved
 from benchmarks.study import picture
+from benchmarks.tables import read
 from dpl import Sample, Scene
 from dpl.evaluation import latency
-from dpl.evaluation.tables import read
 from dpl.fem import Load, Newton
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2

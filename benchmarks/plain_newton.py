@@ -35,11 +35,6 @@ class PlainNewton:
     step_tol: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ValueError: An attribute is out of range.
-        """
         if self.max_iter < 1:
             raise ValueError(f"max_iter = {self.max_iter} must be 1 or more")
         if not 0 <= self.step_tol < math.inf:

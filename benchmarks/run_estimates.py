@@ -7,7 +7,7 @@ from statistics import mean
 from benchmarks.loss_table import LossRow
 from benchmarks.paper_runs import Run
 from benchmarks.paper_tables import Result
-from dpl.evaluation.tables import read
+from benchmarks.tables import read
 
 LOSSES = "losses"  # folder of runs, and stem of their table, whose rows are medians over seeds
 

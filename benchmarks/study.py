@@ -5,7 +5,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from dpl.evaluation.tables import read, show, write, write_machine
+from benchmarks.tables import read, show, write_machine
+from dpl.evaluation.tables import write
 from dpl.visualization import DPI, STYLE
 
 if TYPE_CHECKING:

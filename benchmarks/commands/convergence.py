@@ -120,11 +120,12 @@ def _solvers(
 def _stored_trials(raw: Path, names: list[str]) -> list["Trial"]:
     """Return the measurements in a file if it is newer than its networks and the named ones."""
     from benchmarks.newton_starts import Trial
+    from benchmarks.tables import read
 
     if not raw.is_file():
         return []
     try:
-        trials = tables.read(Trial, raw)
+        trials = read(Trial, raw)
     except ValueError as error:
         raise config.ConfigError(f"{error}; remove it, or set resume=false") from error
     folders = [raw.parent / name for name in {*names, *(trial.network for trial in trials)} if name]

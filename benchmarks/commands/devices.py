@@ -26,6 +26,7 @@ KEYS = (
 def main(cfg: DictConfig) -> None:
     """Measure the chosen networks; rows are written after each network."""
     from benchmarks import device_facts, devices
+    from benchmarks.tables import show
     from dpl.evaluation import tables
     from dpl.system.threads import limited_threads
 
@@ -61,5 +62,5 @@ def main(cfg: DictConfig) -> None:
         raise config.ConfigError("networks: none fits into the memory")
     facts = device_facts.facts(device, cfg.threads)
     stem.with_suffix(".json").write_text(json.dumps(facts) + "\n")
-    tables.show(rows, ", ".join(f"{name} {value}" for name, value in facts.items()))
+    show(rows, ", ".join(f"{name} {value}" for name, value in facts.items()))
     print(f"written to {stem}.csv")

@@ -12,7 +12,6 @@ import dpl
 from benchmarks.commands import CONF
 from dpl import config, fem, inference
 from dpl.commands.cli import command
-from dpl.evaluation import tables
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -53,11 +52,12 @@ def main(cfg: DictConfig) -> None:
 def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
     """Return the errors of other meshes to draw; none without a file."""
     from benchmarks.pareto import Discretisation
+    from benchmarks.tables import read
 
     if cfg.discretisation is None:
         return []
     with config.error_in("discretisation", OSError, ValueError):
-        return tables.read(Discretisation, Path(cfg.discretisation))
+        return read(Discretisation, Path(cfg.discretisation))
 
 
 def _solvers(cfg: DictConfig) -> tuple["dpl.Scene", dict[str, "fem.Solver"], "dpl.Sample"]:

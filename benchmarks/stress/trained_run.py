@@ -52,7 +52,6 @@ class AmplitudeSweep:
     simulator: Simulator = field(init=False)
 
     def __post_init__(self) -> None:
-        """Create the simulator."""
         object.__setattr__(self, "simulator", Simulator(self.surrogate))
 
     @property

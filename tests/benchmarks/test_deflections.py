@@ -7,7 +7,8 @@ import torch
 from omegaconf import OmegaConf
 
 from benchmarks import deflections, mechanics, peers
-from dpl.evaluation.tables import read, write
+from benchmarks.tables import read
+from dpl.evaluation.tables import write
 from dpl.fem import SaintVenantKirchhoff
 
 

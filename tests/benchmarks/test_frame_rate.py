@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from benchmarks import mechanics
-from dpl.evaluation.tables import read
+from benchmarks.tables import read
 from dpl.inference import Simulator
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate

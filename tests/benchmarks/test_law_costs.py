@@ -1,7 +1,8 @@
 """Times of bodies of several laws: a row for each, positive, with one isotropic law as unit."""
 
 from benchmarks import law_costs
-from dpl.evaluation.tables import read, write
+from benchmarks.tables import read
+from dpl.evaluation.tables import write
 
 
 def test_each_body_has_its_time(tmp_path):

@@ -1,7 +1,8 @@
 """Laws of the times of eigenmodes: positive, a row for each beam, the paper's row beside them."""
 
 from benchmarks import modes
-from dpl.evaluation.tables import read, write
+from benchmarks.tables import read
+from dpl.evaluation.tables import write
 
 
 def test_each_beam_has_its_modes_and_times(tmp_path):

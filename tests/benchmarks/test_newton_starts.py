@@ -22,7 +22,8 @@ from benchmarks.newton_starts import (
     summary,
 )
 from benchmarks.plain_newton import PlainNewton
-from dpl.evaluation.tables import read, write
+from benchmarks.tables import read
+from dpl.evaluation.tables import write
 from dpl.fem import Newton, solve
 from dpl.inference import Hybrid
 

@@ -23,9 +23,10 @@ from benchmarks import (
 from benchmarks.loss_table import LossRow
 from benchmarks.paper_runs import Run, RunTime, Session, State
 from benchmarks.paper_tables import Result
+from benchmarks.tables import read
 from dpl.commands import dry_run
 from dpl.config import CONF
-from dpl.evaluation.tables import read, write
+from dpl.evaluation.tables import write
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = OmegaConf.to_container(OmegaConf.load(ROOT / "benchmarks/conf/paper.yaml"))

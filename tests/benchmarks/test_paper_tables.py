@@ -8,7 +8,8 @@ import torch
 
 from benchmarks import methods, paper_tables, samples
 from benchmarks.paper_tables import Result
-from dpl.evaluation.tables import read, write
+from benchmarks.tables import read
+from dpl.evaluation.tables import write
 from dpl.fem import solve
 from dpl.models import PODNet
 from dpl.training import MSE, Surrogate

@@ -7,7 +7,7 @@ import textwrap
 import pytest
 
 from benchmarks import blas_detection, peers
-from dpl.evaluation.tables import read
+from benchmarks.tables import read
 from dpl.fem import solve
 
 

@@ -118,7 +118,6 @@ class SubspaceNewton:
         return cls(problem, vectors, cells, **options)
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         refuse_follower_loads(self.problem, type(self).__name__)
         check_tol(self.tol)
         for name in ("error_tol", "min_damping", "min_detF_ratio"):
