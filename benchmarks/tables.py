@@ -1,4 +1,4 @@
-"""Tables of results: rows of a dataclass are printed and read again, with the machine beside them."""
+"""Tables of results: print rows of a dataclass and read them again; the machine beside them."""
 
 import csv
 import json

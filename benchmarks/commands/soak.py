@@ -27,6 +27,7 @@ def main(cfg: DictConfig) -> None:
     """Train, simulate and record the resources of both."""
     # Worker processes import this file and need none of these imports.
     from benchmarks import soak
+    from benchmarks.tables import write_machine
     from dpl.evaluation import tables as table
     from dpl.inference import Simulator
 
@@ -40,7 +41,7 @@ def main(cfg: DictConfig) -> None:
         rows.extend(work)
         wrong.extend(f"{work[-1].workload}: {line}" for line in soak.regressions(work))
         table.write(rows, folder / "soak.csv")
-        table.write_machine(folder / "machine.json")
+        write_machine(folder / "machine.json")
         soak.draw(rows, folder / "soak.png")
         print(soak.summary(work))
 

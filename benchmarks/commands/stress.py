@@ -25,6 +25,7 @@ def main(cfg: DictConfig) -> None:
     """Run the cases; rows are written after each case, the figure at the end."""
     from benchmarks import stress
     from benchmarks.stress.drawing import draw
+    from benchmarks.tables import write_machine
 
     try:
         cases = stress.select_cases(cfg.cases)
@@ -53,7 +54,7 @@ def main(cfg: DictConfig) -> None:
             f"    expected: {line.expected}\n    observed: {line.observed}",
             soft_wrap=True,
         )
-    table.write_machine(folder / "machine.json")
+    write_machine(folder / "machine.json")
     if levels:
         draw(levels, folder / "load_sweeps.png")
     print(_summary(lines))
