@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 
-from benchmarks.tables import machine
+from dpl.evaluation.tables import machine
 
 Choice = Literal["auto", "cpu", "cuda"]
 

@@ -14,8 +14,8 @@ from omegaconf import DictConfig
 from benchmarks import generation as ways
 from benchmarks import peers
 from benchmarks.study import record, redraw
-from benchmarks.tables import machine
 from dpl import Scene, config
+from dpl.evaluation.tables import machine
 from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed_backends
 from dpl.fem.linear import BACKENDS
 from dpl.inference import Simulator

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from benchmarks.tables import read, show, write_machine
-from dpl.evaluation.tables import write
+from benchmarks.tables import read, write_machine
+from dpl.evaluation.tables import show, write
 from dpl.visualization import DPI, STYLE
 
 if TYPE_CHECKING:

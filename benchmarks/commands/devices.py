@@ -26,8 +26,8 @@ KEYS = (
 def main(cfg: DictConfig) -> None:
     """Measure the chosen networks; rows are written after each network."""
     from benchmarks import device_facts, devices
-    from benchmarks.tables import show
     from dpl.evaluation import tables
+    from dpl.evaluation.tables import show
     from dpl.system.threads import limited_threads
 
     names = list(devices.NETWORKS) if cfg.networks is None else list(cfg.networks)

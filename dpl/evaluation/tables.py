@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import astuple, fields
 from pathlib import Path
@@ -13,6 +14,12 @@ from rich.console import Console
 from rich.table import Table
 
 from dpl.system.files import atomic_write
+
+
+def show(rows: Sequence[Any], title: str) -> None:
+    """Print rows of a dataclass, one column for each field."""
+    columns = [field.name.replace("_", " ") for field in fields(rows[0])]
+    show_cells(title, columns, [[text(value, 3) for value in astuple(row)] for row in rows])
 
 
 def show_cells(title: str, columns: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:
@@ -58,6 +65,14 @@ def write(rows: Sequence[Any], path: Path) -> None:
     writer.writerows([text(value, 4) for value in astuple(row)] for row in rows)
     with atomic_write(path) as file:
         file.write(lines.getvalue().encode())
+
+
+def machine() -> str:
+    """Return processor and number of cores of this machine."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{models[0] if models else 'unknown processor'}, {os.cpu_count()} cores"
 
 
 def text(value: object, digits: int) -> str:
