@@ -4,7 +4,6 @@ import json
 import pickle
 from dataclasses import dataclass, replace
 
-import lightning as L
 import pytest
 import torch
 from laws import HOOKEAN
@@ -30,6 +29,7 @@ from dpl.training import (
     RelativeL2,
     ResidualRatio,
     Surrogate,
+    fit,
 )
 
 SPAN = [0.2, 0.4]
@@ -433,16 +433,7 @@ def test_a_network_that_is_told_poissons_ratio_is_clearly_better(make_scene, tmp
 
 def test_a_solver_with_ranges_is_fitted_and_evaluated(wide, sets, tmp_path, monkeypatch):
     module = Surrogate(Unrolled(wide, rank=60, cells=16, stages=1), MSE(), wide)
-    trainer = L.Trainer(
-        max_epochs=1,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        accelerator="cpu",
-        limit_val_batches=0,
-    )
-    trainer.fit(module, datamodule=sets)
+    fit(module, sets)
     module.eval()
     test = sets.samples("test")
     linear = fem.solve(wide.linear, test.load).displacement

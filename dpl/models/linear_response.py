@@ -209,7 +209,10 @@ class LinearResponse:
             places[orbits.images.flatten()] = torch.arange(orbits.images.numel())
             scales = orbits.sign * orbits.weight
             own = orbits.images, orbits.sign, scales, parities.characters, places, self._supports
-            self._orbits_on[device] = _Orbits(*(part.to(device) for part in own))
+            made = _Orbits(*(part.to(device) for part in own))
+            if torch.compiler.is_compiling():
+                return made
+            self._orbits_on[device] = made
         return self._orbits_on[device]
 
     def _tensors(self, device: torch.device) -> "_Blocks":
@@ -218,7 +221,10 @@ class LinearResponse:
             if self.iteration.varies:
                 columns, entries = self._matrices.padded()
             layers = CondensedLayers.of(self.blocks, device)
-            self._blocks_on[device] = _Blocks(layers, columns.to(device), entries.to(device))
+            made = _Blocks(layers, columns.to(device), entries.to(device))
+            if torch.compiler.is_compiling():  # tensors of a traced graph have no values
+                return made
+            self._blocks_on[device] = made
         return self._blocks_on[device]
 
 

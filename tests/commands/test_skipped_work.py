@@ -7,6 +7,7 @@ from dpl.data import DataModule
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.fem import Load, Problem, solve
 from dpl.fem.assembly import element_loops
+from dpl.fem.assembly.discretisation import Discretisation
 from dpl.fem.linear import SuperLU
 from dpl.models import FCNN
 from dpl.training import MSE, LrPlus, LrStar, Surrogate
@@ -94,8 +95,8 @@ def test_one_law_without_fibres_has_nothing_of_its_cells(make_scene, monkeypatch
 def test_pattern_and_ordering_are_analysed_once(make_scene, calls, monkeypatch):
     scene = make_scene()
     analysed = []
-    original = Problem.pattern.func
-    monkeypatch.setattr(Problem.pattern, "func", lambda p: analysed.append(p) or original(p))
+    original = Discretisation.pattern.func
+    monkeypatch.setattr(Discretisation.pattern, "func", lambda p: analysed.append(p) or original(p))
     load = scene.loads.sample((0, 0), range(4))
     solve(scene.solver, load)
     solve(scene.solver, load)

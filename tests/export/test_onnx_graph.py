@@ -297,10 +297,11 @@ def test_scales_and_weights_suffice_to_evaluate_the_network_without_this_package
     weights, scales = load_file(folder / "weights.safetensors"), meta["scales"]
     unit = found["young"] * scales["force_unit"] * scales["force"]
     x = (found["force"].reshape(-1) / unit)[meta["dofs"]["loadable"]].astype(np.float32)
+    stages = "predictor.net.stages"
     for k in (0, 2, 4, 6):
-        x = weights[f"net.stages.{k}.weight"] @ x + weights[f"net.stages.{k}.bias"]
+        x = weights[f"{stages}.{k}.weight"] @ x + weights[f"{stages}.{k}.bias"]
         if k < 6:
-            x = np.where(x > 0, x, weights[f"net.stages.{k + 1}.weight"] * x)
+            x = np.where(x > 0, x, weights[f"{stages}.{k + 1}.weight"] * x)
     answer = np.zeros(meta["dofs"]["count"])
     answer[np.setdiff1d(np.arange(len(answer)), meta["dofs"]["fixed"])] = x
     answer *= scales["length"] * scales["displacement"]

@@ -1,5 +1,6 @@
 """Linear solutions of all loads and parameters: compiled, as tensors, and their derivatives."""
 
+from functools import partial
 from itertools import cycle
 
 import pytest
@@ -135,7 +136,7 @@ def test_a_batch_is_solved_like_its_members(name, monkeypatch):
     loaded, own = at_free(scene, forces(scene)), parameters(scene)
     whole = response(loaded, own)
     members = [response(loaded[k : k + 1], own[k : k + 1]) for k in range(len(loaded))]
-    assert relative(torch.cat(members), whole) < 1e-12
+    assert relative(torch.cat(members), whole) < 1e-6  # larger batches multiply in float32
     monkeypatch.setattr(linear_response, "MAX_VALUES", 1)
     monkeypatch.setattr(LinearResponse, "solve", LinearResponse.by_tensors)  # as on a GPU
     assert relative(response(loaded, own), whole) < 1e-6
@@ -249,8 +250,8 @@ def test_networks_take_this_linear_solution_as_their_base(three):
     expected = next(iter(three.linear.iterate(load))).displacement
     assert relative(LinearBase(three).solve(load).flatten(1), expected.flatten(1)) < 1e-4
     torch.manual_seed(0)
-    net = FCNN(three, width=16, base="linear")
-    surrogate = Surrogate(net, RMSELoss(relative=1.0, floor=0.0), three)
+    loss, network = RMSELoss(relative=1.0, floor=0.0), partial(FCNN, width=16)
+    surrogate = Surrogate.from_network(network, loss, three, base="linear")
     small = fem.Load(1e-7 * load.force, load.young, load.parameters)
     with torch.no_grad():
         found = surrogate.predict(small)
@@ -264,5 +265,5 @@ def test_stiffnesses_that_differ_too_much_are_refused_before_any_training(other)
     newton = fem.Newton(body)
     scene = Scene(body, fem.ModalLoads(newton.linear_solver, n_modes=3, deflection=0.1), newton)
     for build in (Unrolled, LinearBase):
-        with pytest.raises(ValueError, match=r"core.young.* takes more than 200 steps.*base=none"):
+        with pytest.raises(ValueError, match=r"core.young.* takes more than 200 steps.*base=null"):
             build(scene)

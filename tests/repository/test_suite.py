@@ -17,7 +17,12 @@ def asserts(function, helpers):
             return True
         if isinstance(node, ast.Call):
             name = getattr(node.func, "attr", getattr(node.func, "id", ""))
-            if name in {"raises", "warns", "fail"} | helpers or name.startswith("assert_"):
+            if name in {
+                "raises",
+                "warns",
+                "fail",
+                "run_state_machine_as_test",
+            } | helpers or name.startswith("assert_"):
                 return True
     return False
 
