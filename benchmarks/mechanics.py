@@ -245,7 +245,7 @@ def frames(cfg: DictConfig) -> None:
         ConfigError: The extra `viewer` is not installed.
     """
     from dpl import load, viewer
-    from dpl.commands.view import require_viewer
+    from dpl.commands.cli import require_viewer
     from dpl.evaluation.timing import describe
 
     run = _run(cfg, "frames")

@@ -22,6 +22,7 @@ from dpl import config
 from dpl.commands import dry_run, help_text
 from dpl.config import CONF, ConfigError, Keys
 from dpl.system.files import DataSetError
+from dpl.version import install
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
@@ -146,11 +147,18 @@ def check_extras(cfg: DictConfig) -> None:
     if extras.get("enforce_tags") and not cfg.tags:
         raise ConfigError("tags = [] must name one tag or more; or set extras.enforce_tags=false")
     if extras.get("view"):
-        from dpl.commands.view import require_viewer
-
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             raise ConfigError("extras.view = true needs one run; leave it out of a sweep")
         require_viewer()
+
+
+def require_viewer() -> None:
+    """Raise a `ConfigError` unless the packages of the viewer are installed."""
+    try:
+        import dpl.viewer.page  # noqa: F401
+    except ImportError as error:
+        reason = f"the viewer cannot be imported ({error}): {install('viewer')}"
+        raise ConfigError(reason) from error
 
 
 def check_trainer(trainer: Any, cfg: DictConfig) -> None:

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 import dpl
 from dpl import config, viewer
-from dpl.commands.cli import command
+from dpl.commands.cli import command, require_viewer
 from dpl.version import install
 
 
@@ -23,16 +23,6 @@ def main(cfg: DictConfig) -> None:
     require_viewer()
     policy = bind(cfg)
     serve(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
-
-
-def require_viewer() -> None:
-    """Raise a `ConfigError` unless the packages of the viewer are installed."""
-    try:
-        import dpl.viewer.page  # noqa: F401
-    except ImportError as error:
-        raise config.ConfigError(
-            f"the viewer cannot be imported ({error}): {install('viewer')}"
-        ) from error
 
 
 def serve(
