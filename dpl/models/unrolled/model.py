@@ -338,7 +338,7 @@ class Unrolled(StoredBuffers):
             "no modes for linear solutions: K(0) is condensed into dense blocks",
         ]
         if members > 1:
-            lines.append(f"no further solves for {members} symmetries: images of samples are fitted")
+            lines.append(f"no solves for {members - 1} symmetries: images of samples are fitted")
         return lines
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
