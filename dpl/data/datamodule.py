@@ -133,10 +133,7 @@ class DataModule(L.LightningDataModule):
         module that is trained may encode the samples.
         """
         module, samples = getattr(self.trainer, "lightning_module", None), self.samples("train")
-        encode = getattr(module, "encode", lambda samples, group: None)
-        data = encode(samples, self.group)
-        if data is None:
-            data = Samples(samples, self.group)
+        data: Dataset = getattr(module, "encode", Samples)(samples, self.group)
         rank, world_size = self.rank_and_world_size
         seed = self.shuffle_seed
         sampler: DistributedSampler = DistributedSampler(data, world_size, rank, seed=seed)

@@ -59,7 +59,7 @@ class Predictor(StoredBuffers):
         return self(batch.load), batch
 
     def dataset(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
-        """Return what the predictor is trained on: samples and their images.
+        """Return the training set: samples and their images.
 
         Args:
             samples: The samples, (S, N, D).

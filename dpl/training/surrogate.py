@@ -120,7 +120,7 @@ class Surrogate(L.LightningModule):
         return [*self.predictor.skipped_work(), *self.loss.skipped_work()]
 
     def encode(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
-        """Return what the network is trained on, see `Predictor.dataset`."""
+        """Return the training set of samples and their images, see `Predictor.dataset`."""
         return self.predictor.dataset(samples, group)
 
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
