@@ -112,7 +112,7 @@ def test_corrections_bring_answers_nearer_and_leave_the_network_alone(scene, bat
     module.fit_bases(batch)
     with torch.no_grad():
         for parameter in module.net.parameters():
-            parameter.mul_(0.3)
+            parameter.mul_(0.1)
     plain = methods.Method(module.predict, len(batch.force), 2.0, 5)
     corrected = methods.corrected(module, plain, batch, rank=20, tolerance=1e-4, steps=2)
     with torch.no_grad():
@@ -121,7 +121,7 @@ def test_corrections_bring_answers_nearer_and_leave_the_network_alone(scene, bat
     before, after = sizes(first - batch.displacement), sizes(after - batch.displacement)
     small = sizes(batch.displacement) < 0.5  # from an untrained network larger ones may fail
     assert int(small.sum()) >= 4
-    assert float((after[small] / before[small]).min()) < 0.1
+    assert float(after[small].median()) < 0.1 * float(before[small].median())
     assert (after <= before * (1 + 1e-9)).all()
     assert (corrected.samples, corrected.parameters) == (plain.samples, 5)
     assert corrected.training_minutes > 2
