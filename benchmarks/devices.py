@@ -30,14 +30,12 @@ from dpl.training import MSE, Surrogate
 
 FIT = "unrolled"  # has no training step
 NETWORKS: dict[str, tuple[Callable[..., nn.Module], Base | None]] = {
-    "fcnn": (partial(FCNN, width=512), None),
-    "fcnn linear": (partial(FCNN, width=512), "linear"),
+    "fcnn": (partial(FCNN, width=512), "linear"),
+    "fcnn plain": (partial(FCNN, width=512), None),
     "fcnn full": (partial(FCNN, all_dofs=True), None),  # of the paper, 4 n^2 + 7 n parameters
-    "cnn": (CNN, None),
-    "cnn linear": (CNN, "linear"),
-    "gnn": (GNN, None),
-    "gnn linear": (GNN, "linear"),
-    "pod": (PODNet, None),
+    "cnn": (CNN, "linear"),
+    "gnn": (GNN, "linear"),
+    "pod": (PODNet, "linear"),
     FIT: (lambda scene, _: Unrolled(scene), None),
 }
 TRAINING = "training step"

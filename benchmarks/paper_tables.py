@@ -36,7 +36,7 @@ PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int | None]]
 }
 STREAMS = {"twice": 4, "small": 5}  # of loads; those of samples and scales are below
 CORRECTED = " corrected"  # ends the name of a network that is corrected
-ON_LINEAR = "_linear"  # ends the name of a network on the linear solution; see conf/experiment
+PLAIN = "_plain"  # ends the name of a network without the linear solution
 LEAST_DRAWN, MOST_DRAWN = 1e-9, 1e3  # errors beyond are drawn there [-]
 GOLDEN = 0.618034  # distance of successive dots across a row, modulo 1, in heights of a row
 TITLES = {
@@ -202,7 +202,7 @@ def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
     """
     sets = list(dict.fromkeys(title for _, title in errors))
     methods = list(dict.fromkeys(method for method, _ in errors))
-    families = {m: m.removesuffix(CORRECTED).removesuffix(ON_LINEAR) for m in methods}
+    families = {m: m.removesuffix(CORRECTED).removesuffix(PLAIN) for m in methods}
     colours = method_colours(families.values())
     with picture(path, 2.6 * len(sets) + 1.6, 0.3 * len(methods) + 1.0) as figure:
         axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]

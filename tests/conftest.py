@@ -60,7 +60,7 @@ def tiny() -> list[str]:
 def tiny_training(tiny) -> list[str]:
     """Overrides that make a short training run, without worker processes."""
     data = ["data.train=16", "data.val=4", "data.test=4", "data.batch_size=8", "data.workers=0"]
-    return [*tiny, *data, "trainer.check_val_every_n_epoch=1", "model.width=16"]
+    return [*tiny, *data, "trainer.check_val_every_n_epoch=1", "experiment=paper", "model.width=16"]
 
 
 def _tiny(

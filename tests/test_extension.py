@@ -188,7 +188,7 @@ def test_a_part_of_a_user_is_trained_evaluated_viewed_and_exported(script, home,
 
     mesh = [] if part == "mesh function" else ["mesh.nodes=[4,2,2]"]
     modes = [] if part == "load family" else ["loads.n_modes=2"]
-    width = [] if part == "network" else ["model.width=4"]
+    width = [] if part == "network" else ["model=fcnn", "model.width=4"]
     own = ["--config-dir", "my_conf", *CHOICES[part]]
     run("train", *own, *mesh, *modes, *width, *TINY, "run=runs/a")
     refused = script("evaluate", "run=runs/a", cwd=home)

@@ -290,7 +290,8 @@ def _network(cfg: DictConfig, scene: Scene) -> tuple[Any, dict[str, Any]]:
     """Return the network of `model`, and those of its keys that are options of the surrogate."""
     require_keys(cfg, "model")
     node = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg.model, resolve=True))
-    predictor = {key: node.pop(key) for key in validation.PREDICTOR if key in node}
+    given = {key: node.pop(key) for key in validation.PREDICTOR if key in node}
+    predictor = {"base": "linear", **given}
     with error_in("model"):
         inputs = models.Inputs.from_scene(scene, **predictor)
     more = {"inputs": inputs} if "inputs" in validation.options_of(node) else {}

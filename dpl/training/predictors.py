@@ -277,13 +277,13 @@ def predictor_of(
 ) -> Predictor:
     """Return the predictor of a network, or of a model that is fitted (it defines `fit`).
 
+    A fitted model has no base beside its own.
+
     Raises:
         ValueError: There is no such base, or it excludes another option.
     """
     Inputs.from_scene(scene, base, young=young)  # checks the options
     if hasattr(net, "fit"):
-        if base is not None:
-            raise ValueError(f"{type(net).__name__} requires base = null, not {base}")
         return Fitted(net, scene)
     return Scaled(net, scene, young=young) if base is None else OnLinearSolution(net, scene)
 

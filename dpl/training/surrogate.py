@@ -84,7 +84,7 @@ class Surrogate(L.LightningModule):
         loss: Loss,
         scene: Scene,
         *,
-        base: Base | None = None,
+        base: Base | None = "linear",
         young: bool = False,
         **options: Any,
     ) -> Self:

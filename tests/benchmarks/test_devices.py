@@ -39,7 +39,7 @@ def test_a_timed_training_step_lowers_the_loss(scene, samples):
 
 
 def test_a_timed_prediction_is_that_of_the_surrogate_with_repeated_loads(scene, samples):
-    surrogate = devices.fitted("cnn linear", scene, samples)
+    surrogate = devices.fitted("cnn", scene, samples)
     predict = devices.prediction(surrogate, samples, 30, copies=True)
     with torch.inference_mode():
         expected = surrogate.predict(samples.load)

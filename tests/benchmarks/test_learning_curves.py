@@ -51,10 +51,10 @@ def test_a_run_with_fewer_than_two_validations_has_no_curve(tmp_path):
 
 def test_rows_and_a_picture_are_written(tmp_path):
     write_events(tmp_path / "fcnn", {0: 0.5, 1: 0.25})
-    write_events(tmp_path / "fcnn_linear", {0: 0.05, 9: 0.004})
-    runs = [tmp_path / "fcnn", tmp_path / "fcnn_linear"]
+    write_events(tmp_path / "pod", {0: 0.05, 9: 0.004})
+    runs = [tmp_path / "fcnn", tmp_path / "pod"]
     assert learning_curves.save(runs, tmp_path / "curves")
     rows = list(csv.DictReader((tmp_path / "curves.csv").open()))
-    assert [row["method"] for row in rows] == ["fcnn", "fcnn", "fcnn_linear", "fcnn_linear"]
+    assert [row["method"] for row in rows] == ["fcnn", "fcnn", "pod", "pod"]
     assert float(rows[-1]["rel_L2_median"]) == pytest.approx(0.004)
     assert Image.open(tmp_path / "curves.png").size == (1120, 680)

@@ -33,7 +33,7 @@ SHIPPED = OmegaConf.to_container(OmegaConf.load(ROOT / "benchmarks/conf/paper.ya
 PLAN = {
     "one": {
         "experiments": ["beam_svk", "propeller_nh"],
-        "runs": {"fcnn": ["model=fcnn", "trainer.max_epochs=60"], "pod": ["experiment=pod"]},
+        "runs": {"fcnn": ["model=fcnn", "trainer.max_epochs=60"], "pod": ["experiment=paper"]},
     },
     "losses": {
         "experiments": ["beam_nh_loss"],
@@ -84,7 +84,7 @@ def test_each_run_is_planned_for_each_experiment_and_value():
 def test_a_recipe_is_combined_with_the_experiment_and_sizes_replace_options():
     runs = planned(more=["data.train=8"])
     assert runs["propeller_nh/pod"].options == (
-        "experiment=[propeller_nh,pod]",
+        "experiment=[propeller_nh,paper]",
         "trainer.max_epochs=1",
         "data.train=8",
     )
@@ -226,7 +226,7 @@ def test_times_are_sums_over_sessions_with_the_same_options(run, tmp_path):
     ]
     (tmp_path / run.path).mkdir(parents=True)
     (tmp_path / run.path / "training.jsonl").write_text('{"seconds": 90.0}\n')
-    other = Run("one", "beam_svk/pod", ("experiment=pod",))
+    other = Run("one", "beam_svk/pod", ("experiment=paper",))
     row, total = paper_runs.times([run, other], tmp_path, sessions)
     assert (row.sessions, row.end, row.minutes, row.training_minutes) == (2, "finished", 3.0, 1.5)
     assert (total.run, total.minutes, total.end) == ("total", 3.0, "interrupted")

@@ -251,54 +251,44 @@ def test_callbacks_and_loggers_are_changed_added_and_removed_by_name(compose):
     assert [type(logger).__name__ for logger in trainer.loggers] == ["CSVLogger"] * 2
 
 
-def test_a_recipe_chooses_model_optimiser_and_loss(compose):
-    cfg = compose("experiment=pod", "folder=.", command="train")
-    build.check(cfg)
-    assert cfg.model == compose("model=pod", "folder=.", command="train").model
-    assert cfg.optimizer._target_.endswith("Muon")
-    assert cfg.optimizer.lr == 5e-3
-    assert cfg.optimizer.momentum == 0.95, "the rest is that of conf/optimizer"
-    assert cfg.loss._target_.endswith("RMSELoss")
-    assert (cfg.data.batch_size, cfg.trainer.max_epochs) == (512, 188)
-    assert "defaults" not in cfg
+def test_a_model_brings_the_batch_size_and_the_epochs_that_suit_it(compose):
+    usual, cfg = (compose(f"model={name}", "folder=.", command="train") for name in ("fcnn", "cnn"))
+    assert (usual.data.batch_size, cfg.data.batch_size) == (256, 16)
+    assert cfg.model._target_.endswith("CNN")
+    assert cfg.optimizer == usual.optimizer
 
 
-def test_the_command_line_wins_over_a_recipe(compose):
+def test_the_command_line_wins_over_an_experiment(compose):
     """In any order on the command line, by name of the option and by number."""
-    for choice in (["experiment=pod", "loss=lr_star"], ["loss=lr_star", "experiment=pod"]):
+    for choice in (["experiment=paper", "loss=rmse"], ["loss=rmse", "experiment=paper"]):
         cfg = compose(*choice, "folder=.", command="train")
-        assert cfg.loss._target_.endswith("LrStar")
-        assert cfg.optimizer._target_.endswith("Muon")
-    numbers = ["optimizer.lr=1e-3", "data.batch_size=8", "loss.relative=0.5"]
-    cfg = compose(*numbers, "experiment=pod", "folder=.", command="train")
-    assert (cfg.optimizer.lr, cfg.data.batch_size, cfg.loss.relative) == (1e-3, 8, 0.5)
-    cfg = compose("experiment=pod", "optimizer=adamw", "folder=.", command="train")
-    assert cfg.optimizer._target_.endswith("AdamW")
+        assert cfg.loss._target_.endswith("RMSELoss")
+        assert cfg.optimizer._target_.endswith("AdamW")
+    numbers = ["optimizer.lr=1e-2", "data.batch_size=8", "model=pod", "model.base=linear"]
+    cfg = compose(*numbers, "experiment=paper", "folder=.", command="train")
+    assert (cfg.optimizer.lr, cfg.data.batch_size, cfg.model.base) == (1e-2, 8, "linear")
     build.check(cfg)
-
-
-def test_another_optimiser_keeps_the_rate_of_its_file_in_a_recipe(compose):
-    """5e-3 is Muon's."""
-    usual = compose("folder=.", command="train").optimizer.lr
-    cfg = compose("experiment=pod", "optimizer=adamw", "folder=.", command="train")
-    assert cfg.optimizer.lr == usual
 
 
 @pytest.mark.parametrize("name", options("model"))
-def test_a_model_alone_keeps_the_default_optimiser_and_loss(compose, name):
+def test_every_model_has_the_linear_solution_unless_the_paper_is_asked_for(compose, name):
     cfg = compose(f"model={name}", "folder=.", command="train")
+    assert cfg.model.get("base") == ("linear" if name != "unrolled" else None)
+    assert cfg.optimizer._target_.endswith("Muon")
+    cfg = compose(f"model={name}", "experiment=paper", "folder=.", command="train")
+    assert cfg.model.base is None
     assert cfg.optimizer._target_.endswith("AdamW")
     assert cfg.loss._target_.endswith("LrStar")
-    assert cfg.data.batch_size == 64
+    assert (cfg.data.batch_size, cfg.data.symmetry) == (64, False)
 
 
 def test_experiments_are_combined(compose):
     experiment = compose("experiment=beam_nh_loss", "folder=.", command="train")
-    cfg = compose("experiment=[beam_nh_loss,pod]", "folder=.", command="train")
+    cfg = compose("experiment=[beam_nh_loss,paper]", "folder=.", command="train")
     build.check(cfg)
     assert cfg.mesh == experiment.mesh
     assert cfg.data.train == experiment.data.train == 4095
-    assert cfg.loss._target_.endswith("RMSELoss")
+    assert cfg.loss._target_.endswith("LrStar")
 
 
 def test_loads_of_different_seeds_are_different_data(compose, scene, tmp_path):

@@ -14,7 +14,7 @@ from dpl.config import ConfigError, build, resume, run_folder, validation
 
 STORED = {  # options of train.py
     "default": [],
-    "linear pod": ["experiment=pod_linear", "callbacks=ema", "logger=wandb"],
+    "linear pod": ["model=pod", "callbacks=ema", "logger=wandb"],
     "stream of mixed loads": [
         *("loads=mixture", "data=online", "model=gnn", "loss=blended", "optimizer=muon"),
         *("callbacks=early_stopping", "logger=csv", "trainer=ddp"),

@@ -362,7 +362,7 @@ def test_a_sweep_without_optuna_says_in_one_line_what_to_install(script, argumen
 
 
 def test_hyperparameters_are_flat_and_a_call_goes_by_its_name(compose):
-    cfg = compose("folder=.", "experiment=pod", "young=[1e6,2e11]", command="train")
+    cfg = compose("folder=.", "model=pod", "young=[1e6,2e11]", command="train")
     flat = build.hyperparameters(cfg)
     assert flat["model"] == "PODNet"
     assert (flat["model.width"], flat["optimizer.lr"], flat["loss"]) == (256, 5e-3, "RMSELoss")

@@ -213,7 +213,7 @@ def test_a_run_is_loaded_and_evaluated(script, tiny, tmp_path, data):
         "online": ["data.train.batches=2"],
     }[data]
     short = ["model.width=4", "trainer.max_epochs=1", "trainer.check_val_every_n_epoch=1"]
-    options = [*tiny, "experiment=gnn_linear", f"data={data}", *sizes, *short, "run=run"]
+    options = [*tiny, "model=gnn", f"data={data}", *sizes, *short, "run=run"]
     trained = script("train", *options, cwd=tmp_path)
     assert trained.status == 0, trained.err
     surrogate = dpl.load(tmp_path / "run").surrogate

@@ -34,6 +34,7 @@ def answer_of(net, force):
 def build(request, scene, batch):
     """Returns a network with the defaults of its file for a seed; bases are fitted to a batch."""
     node = OmegaConf.load(request.param)
+    node = node.get("model", node)  # beside batch size and epochs that suit it
     own = {key: node[key] for key in node if key not in PREDICTOR}
 
     def build(seed=0):

@@ -22,7 +22,7 @@ def overrides(tiny_training):
     """The command line of a run of four epochs on the tiny scene."""
 
     def overrides(name, *more):
-        small = ["experiment=pod", "model.blocks=1", "model.coordinates=8", "data.folder=data"]
+        small = ["model=pod", "model.blocks=1", "model.coordinates=8", "data.folder=data"]
         return [*tiny_training, *small, "trainer.max_epochs=4", f"run={name}", *more]
 
     return overrides

@@ -52,11 +52,11 @@ SCENES = {  # overrides of conf/generate.yaml
     "yeoh": [*TINY, "material=yeoh_k2", "+mesh.cell=tetra"],
 }
 NETWORKS = {  # of conf/train.yaml
-    "fcnn": ["model.width=8"],
-    "pod": ["experiment=pod", "model.width=8", "model.rank=10", "model.coordinates=9"],
+    "fcnn": ["model=fcnn", "model.width=8"],
+    "pod": ["model=pod", "model.width=8", "model.rank=10", "model.coordinates=9"],
     "cnn": ["model=cnn", "model.channels=2", "loss=lr_plus"],
     "gnn": ["model=gnn", "model.width=4", "loss=energy"],
-    "online": ["data=online", "model.width=8", "loss=blended"],
+    "online": ["model=fcnn", "data=online", "model.width=8", "loss=blended"],
 }
 OTHERS = ("evaluate", "benchmark", "convergence", "pareto", "results", "verify", "stress")
 

@@ -107,7 +107,7 @@ def home(tmp_path_factory):
 def train(script, tiny_training, home):
     """Trains a run in a folder of this module with a shared data set."""
 
-    def train(name, *overrides, status=0, model=("model.width=8",)):
+    def train(name, *overrides, status=0, model=("experiment=paper", "model.width=8")):
         kept = [one for one in tiny_training if not one.startswith("model.")]
         common = [*kept, *model, *QUIET, f"data.folder={home}/data", f"run={name}"]
         ended = script("train", *common, *overrides, cwd=home)

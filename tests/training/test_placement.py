@@ -175,9 +175,9 @@ class TestGPU:
 
 
 RUNS = {
+    "plain": ["experiment=paper", "model.width=16"],
     "fcnn": ["model=fcnn", "model.width=16"],
-    "fcnn linear": ["experiment=fcnn_linear", "model.width=16"],
-    "pod": ["experiment=pod"],
+    "pod": ["model=pod"],
     "unrolled": ["model=unrolled"],
 }
 
