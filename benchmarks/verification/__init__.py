@@ -49,25 +49,18 @@ CASES: dict[str, Callable[[Path], Section]] = {
 LONG = ("contraction",)  # cases that take more than ten minutes
 
 SHOWN: dict[str, tuple[str, ...]] = {  # values on the page, besides all that exceed their tolerance
-    "laws": (
-        "NH-ln, P11/E at λ = 1.5",
-        "largest relative difference of 90 stresses and stretches",
-    ),
+    "laws": ("largest relative difference of 90 stresses and stretches",),
     "order": (
-        "hex8, order in L2, last pair",
         "hex27, order in L2, last pair",
         "tet4, L2 error, 16³ cells",
-        "tet10, order in L2, last pair",
     ),
     "cook": (
         "Q1, 64 × 64: u_y(48, 52) [mm], deal.II",
         "Q2, 64 × 64: u_y(48, 52) [mm], deal.II",
-        "NH-ln, Q1, 8 × 8: u_y(48, 52) [mm], independent code",
     ),
     "elastica": (
         "hex27, 20 × 1 × 1, α = 10: w/L",
         "tet10, 20 × 1 × 1, α = 10: u/L",
-        "hex8, 40 × 2 × 2, α = 1: error of w/L [%], same mesh",
     ),
     "twist": (
         "hex27, 4 × 4 × 20: torque [N m]",
@@ -76,7 +69,6 @@ SHOWN: dict[str, tuple[str, ...]] = {  # values on the page, besides all that ex
     "locking": (
         "hex8, 16 × 4 × 4, ν = 0.4999",
         "hex8 with mean dilatation, 16 × 4 × 4, ν = 0.4999",
-        "hex27 with mean dilatation bent far, κ/μ = 100000: Newton iterations",
     ),
     "beam": (
         "hex8, 39 × 9 × 9, SVK, q = 40 Pa: u_z [m]",
@@ -87,32 +79,22 @@ SHOWN: dict[str, tuple[str, ...]] = {  # values on the page, besides all that ex
         "SVK, L/h = 40: critical load [N], Euler",
         "L/h = 40, bent, P = 2.5 N: u/L, elastica",
     ),
-    "balance": (
-        "Taylor remainder of the energy with K: order",
-        "moved and turned body: forces, relative",
-        "work / U",
-    ),
+    "balance": ("moved and turned body: forces, relative", "work / U"),
     "nodal_stress": (
         "beam, tet4, 16 × 4 × 4: von Mises stress over the exact one",
-        "beam, hex8, 16 × 4 × 4: von Mises stress over the exact one",
         "cylinder, quad9, 4 × 6: von Mises stress over the exact one",
     ),
     "inflation": (
         "cylinder, quad9, ν = 0.3, p = 0.15 E: r/R, 16 cells",
         "sphere, hex27, ν = 0.3, p = 0.2 E: r/R, 4 cells",
-        "finger, 20 × 4 × 8 hex8: ∫ p dV over the strain energy",
     ),
     "cardiac": (
         "beam, 30 × 6 × 6 hex27: z of (10, 0.5, 1) [mm]",
         "ventricle, 4 in the patch, 14 rings, 3 layers of hex27: z of the apex, endo [mm]",
     ),
-    "contraction": (
-        "4 in the patch, 12 rings, 4 layers of hex27: z of the apex, endo [mm]",
-        "4 in the patch, 12 rings, 4 layers of hex27: z of the apex, epi [mm]",
-    ),
+    "contraction": ("4 in the patch, 12 rings, 4 layers of hex27: z of the apex, endo [mm]",),
     "artery": (
         "neo-Hookean, 16 × 64 quad9, κ/μ = 1e+06: r/R",
-        "Holzapfel-Gasser-Ogden, 16 × 64 quad9, κ/μ = 100: r/R",
         "Holzapfel-Gasser-Ogden, 16 × 64 quad9, κ/μ = 1e+06: r/R",
     ),
     "composites": (
@@ -149,9 +131,7 @@ def page(folder: Path) -> str:
         for cells in summary(k, name, section, SHOWN[name])
     ]
     header = (
-        "case",
-        "references",
-        "within tolerance",
+        "case (source), values within tolerance",
         "quantity",
         "reference",
         "dpl",
@@ -161,11 +141,10 @@ def page(folder: Path) -> str:
         "# Verification",
         "",
         "`python scripts/verify.py` (15 minutes; `cases=[contraction]` 35) compares dpl with known",
-        "solutions, in float64 on one thread, and writes this page. The links behind the numbers",
-        "of values lead to all of them. A tolerance is one unit of the last digit that the source",
-        "prints unless the section states another one; values beyond it are in **bold**. *An",
-        "independent code* is a finite-element program in NumPy, written for these references,",
-        "without a line of dpl.",
+        "solutions, in float64 on one thread, and writes this page; linked files have all values.",
+        "A tolerance is one unit of the last digit that the source prints unless the section states",
+        "another one; values beyond it are in **bold**. *An independent code* is a finite-element",
+        "program in NumPy, written for these references, without a line of dpl.",
         "",
         *table(header, rows),
         "",

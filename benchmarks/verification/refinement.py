@@ -183,9 +183,9 @@ def cook(folder: Path) -> Section:
     _draw_membrane(folder / "cook.png", tips, *found[2, 8])
     return Section(
         "Cook's membrane",
+        "deal.II",
         "deal.II's code gallery, *Quasi-static finite-strain compressible elasticity*, corrected "
-        "2021",
-        "Plane strain, clamped on the left, a dead shear traction of 1/16 N/mm² on the right "
+        "2021: plane strain, clamped on the left, a dead shear traction of 1/16 N/mm² on the right "
         "(NHiso-k4, μ = 0.4225 N/mm², ν = 0.3). An independent code gives further digits and the "
         "other laws.",
         rows,

@@ -93,12 +93,9 @@ def summary(
     found = {row.quantity: row for row in section.rows}
     chosen = [found[quantity] for quantity in shown]
     chosen += [row for row in section.rows if not row.holds and row not in chosen]
-    first = (
-        f"[{number}. {section.title}](#{anchor})",
-        section.source,
-        f"[{count}](verification/{name}.json)",
-    )
-    return [(*(("",) * 3 if k else first), *row.cells()) for k, row in enumerate(chosen)]
+    title = f"[{number}. {section.title}](#{anchor})"
+    first = f"{title} ({section.source}), [{count}](verification/{name}.json)"
+    return [("" if k else first, *row.cells()) for k, row in enumerate(chosen)]
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -491,3 +491,5 @@ def test_the_site_is_made_without_a_warning_and_asks_no_other_host_for_anything(
         text = re.sub(r'<link rel="canonical"[^>]*>', "", page.read_text(encoding="utf-8"))
         assert not fetched.search(text), page
     assert "<mfrac>" in (site / "concepts.html").read_text(encoding="utf-8")
+    assert (site / "search/search_index.js").is_file()  # the search of pages from the disk
+    assert '<script src="iframe-worker.js">' in (site / "index.html").read_text(encoding="utf-8")
