@@ -142,7 +142,7 @@ def page(folder: Path) -> str:
         "",
         "`python scripts/verify.py` (15 minutes; `cases=[contraction]` 35) compares dpl with known",
         "solutions, in float64 on one thread, and writes this page; linked files have all values.",
-        "A tolerance is one unit of the last digit that the source prints unless the section states",
+        "A tolerance is one unit of the last digit that the source prints unless a section states",
         "another one; values beyond it are in **bold**. *An independent code* is a finite-element",
         "program in NumPy, written for these references, without a line of dpl.",
         "",
