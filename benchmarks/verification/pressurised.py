@@ -210,15 +210,11 @@ def inflation(folder: Path) -> Section:
     _draw(folder / "inflation.png", curves)
     return Section(
         "Follower pressure",
-        "A cylinder (plane strain) and a sphere of radii 1 and 2 under internal follower pressure, "
-        "NH-ln, as a quarter and an octant with symmetry conditions; r/R is the ratio of the inner "
-        "radii after and before, from the volume inside. References: the ordinary differential "
-        "equation of radial equilibrium, solved by shooting to 12 digits. The error of r/R has "
-        "the order 2k for elements of degree k; *extrapolated* are the values of the last two "
-        "meshes (Richardson). The finger, 160 × 16 × 16 mm, ν = 0.4, has a closed chamber near its "
-        "upper side and bends; the work of the pressure on the way is an integral by Gauss points.",
+        "radial equilibrium, shooting to 12 digits",
+        "A cylinder and a sphere of radii 1 and 2 (NH-ln), r/R of the inner radius; *extrapolated* "
+        "are the last two meshes (Richardson). The finger of 160 × 16 × 16 mm has a closed "
+        "chamber.",
         rows,
-        [("inflation.png", "Relative error of r/R against the number of cells through the wall.")],
     )
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from decimal import Decimal
 
 
@@ -65,30 +65,37 @@ class Section:
 
     Attributes:
         title: Title of the section.
-        text: Description of the problem and sources of the references.
-        rows: Rows of the table.
-        figures: File names with captions.
-        notes: Further observations.
+        source: Source of the references.
+        text: Description of the problem and of its tolerances.
+        rows: All values.
+        note: What is surprising.
         seconds: Run time [s].
     """
 
     title: str
+    source: str
     text: str
     rows: list[Row]
-    figures: list[tuple[str, str]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    note: str = ""
     seconds: float = 0.0
 
 
-def summary(number: int, section: Section) -> tuple[str, ...]:
-    off = [abs(r.difference) for r in section.rows if not math.isnan(r.difference)]
+def summary(
+    number: int, name: str, section: Section, shown: Sequence[str]
+) -> list[tuple[str, ...]]:
+    """Return the rows of a case in the table of the page: values shown, and values that are off."""
     good = sum(row.holds for row in section.rows)
     anchor = f"{number}-" + "".join(
         c if c.isalnum() or c == "-" else "-" if c == " " else "" for c in section.title.lower()
     )
-    counts = (str(len(section.rows)), str(good) if good == len(section.rows) else f"**{good}**")
-    largest = f"{max(off):.1e}" if off else ""
-    return (f"[{number}. {section.title}](#{anchor})", *counts, largest, f"{section.seconds:.0f}")
+    bold = "" if good == len(section.rows) else "**"
+    count = f"{bold}{good}{bold} of {len(section.rows)}"
+    found = {row.quantity: row for row in section.rows}
+    chosen = [found[quantity] for quantity in shown]
+    chosen += [row for row in section.rows if not row.holds and row not in chosen]
+    title = f"[{number}. {section.title}](#{anchor})"
+    first = f"{title} ({section.source}), [{count}](verification/{name}.json)"
+    return [("" if k else first, *row.cells()) for k, row in enumerate(chosen)]
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -3,21 +3,18 @@
 from pathlib import Path
 from typing import Any
 
-import commands
 import executed
 import formulas
 import gallery
 import links
-import measured
 import modules
 import options
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
-from paths import CONF, DOCS, GENERATED, INCLUDED, NOTEBOOKS, PACKAGE, RESULTS, ROOT
+from paths import CONF, DOCS, INCLUDED, NOTEBOOKS, PACKAGE, RESULTS, ROOT
 
 HERE = Path(__file__).parent
-MADE = dict(zip(GENERATED, (options.page, commands.page, measured.page), strict=True))
 
 
 def on_config(config: MkDocsConfig) -> None:
@@ -46,17 +43,16 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
     def add(path: str, content: str | bytes) -> None:
         files.append(File.generated(config, path, content=content))
 
-    for page, make in MADE.items():
-        add(page, make())
+    add("options.md", options.page())
     for page, source in INCLUDED.items():
         add(page, (ROOT / source).read_text(encoding="utf-8"))
     for path, content in modules.pages():
         add(path, content)
     for path, content in executed.pages():
         add(path, content)
-    for path in measured.files():
+    for path in sorted(RESULTS.iterdir()):
         add(f"results/{path.name}", path.read_bytes())
-    for name in ("style.css", "favicon.svg"):
+    for name in ("style.css", "favicon.svg", "iframe-worker.js"):
         add(name, (HERE / name).read_bytes())
 
 

@@ -11,7 +11,7 @@ LINK = re.compile(r"(?P<mark>!?)\[(?P<text>[^\]]*)\]\((?P<target>[^)\s]+)\)")
 NAME = re.compile(r"(?<![\[`])`(?P<name>dpl(?:\.\w+)+)`(?![\]`])")
 MADE = re.compile(r"(?P<linked><(?:autoref|a) [^>]*>)?<code>(?P<name>dpl(?:\.\w+)+)</code>")
 ELSEWHERE = re.compile(r"[a-z]+:|#|//")
-PLACES = {"conf": "options.md", "benchmarks": "results.md", "scripts": "commands.md"}
+PLACES = {"conf": "options.md", "benchmarks": "measurements.md", "scripts": "options.md"}
 
 
 def outside_code(text: str, change: Callable[[str], str]) -> str:

@@ -1,8 +1,7 @@
 """Reference pages: one per folder of the package, with the names that its `__init__.py` exports.
 
-Each page begins with a table of the public names. A name that several folders export is documented
-on the page of the outermost one: the names of the package first, then those of its folders. The
-other pages list it with a link.
+Each page begins with a table of its names. A name that several folders export is on the page of the
+outermost one alone: the names of the package first, then those of its folders.
 """
 
 import functools
@@ -64,13 +63,14 @@ def page(folder: str) -> str:
 
 def pages() -> Iterator[tuple[str, str]]:
     """Yield paths and texts of the pages."""
-    for folder, names in exports().items():
+    for folder, own in exports().items():
+        names = {f"{folder}.{name}": path for name, path in own.items()}
         text = [f"::: {folder}", "    options: {members: false}", "", "| name | |", "| --- | --- |"]
-        for name, path in names.items():
-            text.append(f"| [`{folder}.{name}`][{documented()[path]}] | {summary(path)} |")
-        for name, path in names.items():
-            if documented()[path] == f"{folder}.{name}":
-                text += ["", f"::: {folder}.{name}", "    options: {heading_level: 2}"]
+        here = {name: path for name, path in names.items() if documented()[path] == name}
+        for name, path in here.items():
+            text.append(f"| [`{name}`][{name}] | {summary(path)} |")
+        for name in here:
+            text += ["", f"::: {name}", "    options: {heading_level: 2}"]
         yield page(folder), "\n".join(text) + "\n"
 
 

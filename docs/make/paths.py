@@ -8,10 +8,6 @@ CONF = ROOT / "conf"
 RESULTS = ROOT / "benchmarks" / "results"
 NOTEBOOKS = ROOT / "notebooks"
 PACKAGE = ROOT / "dpl"
-COMMANDS = {  # folder of commands -> folder of their configurations
-    PACKAGE / "commands": CONF,
-    ROOT / "benchmarks" / "commands": ROOT / "benchmarks" / "conf",
-}
 
 INCLUDED = {  # page of the site -> file of the repository
     "design.md": "DESIGN.md",
@@ -19,4 +15,4 @@ INCLUDED = {  # page of the site -> file of the repository
     "contributing.md": "CONTRIBUTING.md",
     "changelog.md": "CHANGELOG.md",
 }
-GENERATED = ("options.md", "commands.md", "results.md")
+GENERATED = ("options.md",)

@@ -17,11 +17,11 @@ column or the first line states. The numbers are the last cells of a row. An emp
 row `-` are left as they are.
 """
 
+import csv
 import re
 from pathlib import Path
 
-import measured
-from paths import DOCS
+from paths import DOCS, RESULTS
 
 BLOCK = re.compile(
     r"(?P<comment><!-- results: (?P<source>[^>]*?)\n-->\n)\n*"
@@ -69,8 +69,8 @@ def _line(
     for k, column in enumerate(columns, len(cells) - len(columns)):
         if column is not None:
             which = first | column | row
-            csv, names = which.pop("csv"), which.pop(COLUMN).split(", ")
-            numbers = [measured.shown(measured.value(csv, name, which), name) for name in names]
+            stem, names = which.pop("csv"), which.pop(COLUMN).split(", ")
+            numbers = [shown(value(stem, name, which), name) for name in names]
             cells[k] = ", ".join(numbers) if any(numbers) else ""
     return "|" + "".join(f" {cell} |" if cell else " |" for cell in cells)
 
@@ -79,6 +79,45 @@ def stated(text: str) -> dict[str, str]:
     """Return the keys and values of a part of a comment; a name alone is that of the column."""
     pairs = [part.strip().partition("=") for part in text.split(";")]
     return {key if equals else COLUMN: value if equals else key for key, equals, value in pairs}
+
+
+def read(stem: str) -> list[dict[str, str]]:
+    """Return the rows of a file of benchmarks/results/."""
+    with (RESULTS / f"{stem}.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def value(stem: str, column: str, which: dict[str, str]) -> str:
+    """Return one number of a file; `which` has the values of other columns that select its row.
+
+    Raises:
+        LookupError: Not exactly one row matches.
+    """
+    found = [row for row in read(stem) if all(row[c] == x for c, x in which.items())]
+    if len(found) != 1:
+        raise LookupError(f"results/{stem}.csv: {len(found)} rows match {which}")
+    return found[0][column]
+
+
+def shown(text: str, column: str = "") -> str:
+    """Return a number with at most three digits and separated thousands; other text as it is.
+
+    Signal-to-noise ratios [dB] have one decimal.
+    """
+    try:
+        number = float(text)
+    except ValueError:
+        return text.replace("|", "\\|")
+    if number != number or abs(number) == float("inf"):
+        return text
+    if column.startswith("SNR"):
+        return f"{round(number, 1) + 0.0:.1f}"  # no minus sign before zero
+    if number == int(number) and abs(number) < 1e12:
+        return f"{int(number):,}"
+    if 1e-3 <= abs(number) < 1e4:
+        return f"{number:.3g}" if abs(number) < 1000 else f"{number:,.0f}"
+    mantissa, exponent = f"{number:.1e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
 
 
 def pages() -> list[Path]:
