@@ -17,9 +17,8 @@ WORKERS ?= 2
 PIP := $(BIN)/pip install --quiet --no-compile -c constraints.txt  # Python compiles what it imports
 
 FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M)
-DEMO := $(BIN)/python scripts/train.py mesh=paper_beam data.train=64 data.val=16 data.test=8 \
-  model=unrolled model.rank=60 model.cells=80 run=runs/demo
-BEAM := mesh=paper_beam data.train=256 data.val=32 data.test=50
+DEMO := $(BIN)/python scripts/train.py data.train=64 data.val=16 data.test=8 model.rank=60 model.cells=80 \
+  run=runs/demo
 
 .PHONY: setup train demo paper test lint slow gpu matrix mutants tables docs pictures wheel clean
 
@@ -35,10 +34,8 @@ setup: .venv/installed
 	touch $@
 
 train: .venv/run
-	$(BIN)/python scripts/train.py model=unrolled \
-	  $(BEAM) run=$(FIRST)/unrolled $(ARGS)
-	$(BIN)/python scripts/train.py model=fcnn model.width=512 loss=lr_star trainer.max_epochs=60 \
-	  $(BEAM) run=$(FIRST)/fcnn $(ARGS)
+	$(BIN)/python scripts/train.py run=$(FIRST)/unrolled $(ARGS)
+	$(BIN)/python scripts/train.py model=fcnn loss=lr_star run=$(FIRST)/fcnn $(ARGS)
 	$(BIN)/python scripts/compare.py run=$(FIRST)
 
 demo: .venv/run

@@ -81,13 +81,12 @@ class LinearBase:
         return problem.follower_loads.unit_forces(problem.points.new_zeros(1, *problem.shape))
 
     def scale_inputs(self, linear: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-        """Return v / rms(v), (B, N, D), and amplitudes a, (B,), float64.
+        """Return v / rms(v), (B, N, D), and amplitudes a, (B,).
 
         Args:
             linear: Linear solutions v, (B, N, D) [-].
             scale: Displacement scale s, () [-].
         """
-        linear = linear.double()
         free = self._problem.free.to(linear.device)  # no index: a GPU would wait for its size
         square = torch.where(free, linear, 0.0).square().sum(dim=(1, 2)) / free.sum()
         size = torch.where(square > 0, square, 1.0).sqrt()  # the root has no gradient at zero

@@ -45,10 +45,10 @@ class LinearSamples(Samples):
     def __getitems__(self, indices: list[int]) -> LinearBatch:  # type: ignore[override]
         """Return a batch."""
         count = len(self.linear)
-        linear = self.linear[[i % count for i in indices]].double()
+        linear = self.linear[[i % count for i in indices]]
         if self.group:
             linear = self.group.images(linear, torch.tensor([i // count for i in indices]))
-        return LinearBatch(linear.float(), super().__getitems__(indices))
+        return LinearBatch(linear, super().__getitems__(indices))
 
 
 def linear_solutions(load: Load, base: LinearBase) -> Tensor:

@@ -174,14 +174,15 @@ class Scaled(Predictor):
         self.reads_young, self._moduli = young, scene.loads.moduli
 
     def forward(self, load: Load) -> Tensor:
-        """Return displacements over L, (B, N, D) [-], float64."""
+        """Return displacements over L, (B, N, D) [-], in the precision of the forces."""
         field, moduli = self._field(load.force), list[Tensor]()
         if self.reads_young:
             field = (load.young / self._moduli[1])[:, None, None] * field
             moduli = [self._moduli.normalise(load.young)]
         output = self.net(field.to(self.dtype), self.scalars(load, *moduli))
-        displacement = output.double() * self.displacement_scale
-        return torch.where(self.problem.free, displacement, self.problem.prescribed)
+        displacement = output.to(load.force.dtype) * self.displacement_scale
+        prescribed = self.problem.prescribed.to(displacement.dtype)
+        return torch.where(self.problem.free, displacement, prescribed)
 
     def _field(self, force: Tensor) -> Tensor:
         """Return scaled forces (B, N, D) with the values of training on fixed dofs."""
@@ -220,16 +221,16 @@ class OnLinearSolution(Predictor):
         self.base = LinearBase(scene, linear)
 
     def forward(self, load: Load, linear: Tensor | None = None) -> Tensor:
-        """Return displacements over L, (B, N, D) [-], float64.
+        """Return displacements over L, (B, N, D) [-], in the precision of the forces.
 
         Args:
             load: The loads.
             linear: Their linear solutions, (B, N, D) [-], if they are known.
         """
-        linear = self.base.solve(load) if linear is None else linear.double()
+        linear = self.base.solve(load) if linear is None else linear.to(load.force.dtype)
         field, amplitude = self.base.scale_inputs(linear, self.displacement_scale)
         scalars = self.scalars(load, 2 * amplitude / (1 + amplitude) - 1)
-        output = self.net(self.base.whiten(field.to(self.dtype)), scalars).double()
+        output = self.net(self.base.whiten(field.to(self.dtype)), scalars).to(linear.dtype)
         gate = self.base.gate(amplitude)[:, None, None]
         nonlinear = gate * (output * self.displacement_scale)
         return linear + torch.where(self.problem.free, nonlinear, 0.0)

@@ -121,6 +121,9 @@ class Surrogate(L.LightningModule):
 
     def encode(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
         """Return the training set of samples and their images, see `Predictor.dataset`."""
+        fields = (column.to(self.loss.dtype) for column in (samples.force, samples.displacement))
+        force, displacement = fields
+        samples = samples._replace(force=force, displacement=displacement)
         return self.predictor.dataset(samples, group)
 
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:

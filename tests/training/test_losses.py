@@ -266,7 +266,7 @@ def test_residual_losses_are_the_formulas_of_their_terms(few, physics, near):
     for loss, expected in formulas:
         assert float(loss(near, few, physics)) == pytest.approx(float(expected), rel=1e-12)
         found = {name: float(term) for name, term in loss.terms.items()}
-        parts = {"mse": float(error.mean()), "residual": float(norms.mean())}
+        parts = {"error": float(error.mean()), "residual": float(norms.mean())}
         assert found == pytest.approx(parts, rel=1e-12)
 
 

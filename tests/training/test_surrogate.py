@@ -235,7 +235,7 @@ def test_tensorboard_shows_losses_metrics_and_rate(scene, data, tmp_path):
     events.Reload()
     scalars = set(events.Tags()["scalars"])
     wanted = {f"val/{name}" for name in METRICS}
-    wanted |= {"loss/train", "loss/val", "loss/mse", "loss/residual", "lr-AdamW"}
+    wanted |= {"loss/train", "loss/val", "loss/error", "loss/residual", "lr-AdamW"}
     assert wanted <= scalars
     assert len(events.Scalars("loss/train")) == 6  # 3 batches an epoch
     assert len(events.Scalars("val/e_mean")) == 2

@@ -36,16 +36,19 @@ class Loss(L.Callback):
     Attributes:
         terms: Scalars of the last batch, logged as `loss/NAME`.
         saves: Work that this loss saves, one line each.
+        dtype: Precision of the displacements and forces of training batches; energies and
+            residuals cancel digits that float32 does not have.
     """
 
     saves: tuple[str, ...] = ()
+    dtype = torch.float64
 
     def __init__(self) -> None:
         """Start without terms."""
         self.terms: dict[str, Tensor] = {}
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        """Return the loss of displacements over L, (B, N, D), float64, as a scalar."""
+        """Return the loss of displacements over L, (B, N, D), of `dtype`, as a scalar."""
         raise NotImplementedError(f"{type(self).__name__} must define __call__")
 
     def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *_: Any) -> None:

@@ -11,31 +11,34 @@ from dpl.fem.postprocess import tangent_product
 from dpl.scene import Sample
 from dpl.system.checks import check_range
 from dpl.training.losses.loss import Loss, LossContext, PrescribedGradient, squared_error
+from dpl.training.losses.supervised import MSE
 
 
 class LrStar(Loss):
-    """L_r^* = MSE x ||R|| / ||Phi q_max||; the residual norm is a weight without gradient.
+    """L_r^* = error x ||R|| / ||Phi q_max||; the residual norm is a weight without gradient.
 
     As in the paper, the residual norm is averaged over the batch and scales the gradient of the
     whole batch. With `per_sample` it also weights the samples of a batch relative to each other.
+    The error of the paper is the mean squared one.
     """
 
     saves = ("no backward pass through the residual: it is a constant weight",)
 
-    def __init__(self, *, per_sample: bool = False) -> None:
-        """Choose the weighting.
+    def __init__(self, *, error: MSE | None = None, per_sample: bool = False) -> None:
+        """Choose the error and the weighting.
 
         Args:
+            error: Error of displacements; None for `MSE()`.
             per_sample: Weight each sample by its own residual norm, not by the mean of the batch.
         """
         super().__init__()
-        self.per_sample = per_sample
+        self.error, self.per_sample = error or MSE(), per_sample
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        error = squared_error(prediction, batch)
+        error = self.error.errors(prediction, batch)
         weight = residual_norm(prediction.detach(), batch, physics)
         weight = weight if self.per_sample else weight.mean()
-        self.terms = {"mse": error.mean(), "residual": weight.mean()}
+        self.terms = {"error": error.mean(), "residual": weight.mean()}
         return (error * weight).mean()
 
 
@@ -69,7 +72,7 @@ class LrPlus(Loss):
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         error = squared_error(prediction, batch).mean()
         residual = residual_norm(prediction, batch, physics).mean()
-        self.terms = {"mse": error, "residual": residual}
+        self.terms = {"error": error, "residual": residual}
         return error + self.weight * residual
 
 

@@ -1,5 +1,6 @@
 """Supervised losses: squared errors of displacements."""
 
+import torch
 from torch import Tensor
 
 from dpl.scene import Sample
@@ -13,6 +14,7 @@ class MSE(Loss):
     """Mean squared error of u/L over all degrees of freedom."""
 
     saves = ("no finite-element evaluation in training: the loss has no residual term",)
+    dtype = torch.float32
 
     def __init__(self, *, relative: float = 0.0, floor: float = 1e-2) -> None:
         """Choose the weighting.
@@ -27,9 +29,9 @@ class MSE(Loss):
         self.relative, self.floor = relative, floor
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        return self._weighted_errors(prediction, batch).mean()
+        return self.errors(prediction, batch).mean()
 
-    def _weighted_errors(self, prediction: Tensor, batch: Sample) -> Tensor:
+    def errors(self, prediction: Tensor, batch: Sample) -> Tensor:
         """Return mean squared errors over powers of mean squared displacements, (B,)."""
         error = squared_error(prediction, batch)
         if not self.relative:
@@ -45,5 +47,6 @@ class RMSELoss(MSE):
     than in the mean squared error.
     """
 
-    def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        return (self._weighted_errors(prediction, batch) + SMALLEST_SQUARE).sqrt().mean()
+    def errors(self, prediction: Tensor, batch: Sample) -> Tensor:
+        """Return the roots of the errors of `MSE`, (B,)."""
+        return (super().errors(prediction, batch) + SMALLEST_SQUARE).sqrt()
