@@ -109,9 +109,15 @@ def check(
 def run(
     engine: Hydra, args: Namespace, task: Callable[[DictConfig], Any], cfg: DictConfig | None
 ) -> None:
-    """Run the jobs of a command line; `cfg` is the result of `check`."""
+    """Run the jobs of a command line; `cfg` is the result of `check`.
+
+    The folders of the jobs of a sweep are named by the keys that are swept.
+    """
     if cfg is None:
-        lines = [*args.overrides, "hydra.mode=MULTIRUN"]
+        every = map(overrides.parsed, args.overrides)
+        fixed = [f"'{one.key_or_group}'" for one in every if not one.is_sweep_override()]
+        names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]"
+        lines = [*args.overrides, "hydra.mode=MULTIRUN", names]
         run_and_report(lambda: engine.multirun(args.config_name, task, lines))
     else:
         configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)

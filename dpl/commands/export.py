@@ -26,12 +26,13 @@ RESULT_STREAM = (0, 12)  # random stream of the loads in results
 @command("export")
 def main(cfg: DictConfig) -> None:
     """Write the parts that `outputs` names."""
-    from dpl.export.onnx_graph import missing_packages
-
     if not cfg.outputs:
         raise config.ConfigError("outputs = [] must contain one of model, results")
     if "results" in cfg.outputs and cfg.count < 1:
         raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or use outputs=[model]")
+    config.files_of_run(cfg.run)  # refuses a missing run before torch is imported
+    from dpl.export.onnx_graph import missing_packages
+
     if "model" in cfg.outputs and (absent := missing_packages()):
         raise config.ConfigError(
             f"outputs: model needs {', '.join(absent)}: {install('onnx')}, or use outputs=[results]"

@@ -10,22 +10,12 @@ from typing import Any
 
 import hydra
 import torch
-import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from dpl import data, inference, training
 from dpl.config import validation
-from dpl.config.build import (
-    SCENE,
-    build_scene,
-    build_surrogate,
-    hyperparameters,
-    instantiate,
-    moduli,
-    require_keys,
-    to_container,
-)
+from dpl.config.build import SCENE, build_scene, build_surrogate, instantiate, moduli
+from dpl.config.plain import files_of_run, read_config, require_keys, to_container
 from dpl.config.validation import ConfigError
 from dpl.fem import read_mesh as load_mesh
 from dpl.fem.mesh.generators import longest_side
@@ -33,7 +23,6 @@ from dpl.scene import Scene
 from dpl.system.memory import at_most
 
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
-MAX_BYTES = 100_000  # of the configuration of a run
 UNUSABLE = (  # errors of a damaged checkpoint
     *(OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, ArithmeticError),
 )
@@ -82,26 +71,6 @@ def with_own_data(cfg: DictConfig, folder: Path) -> DictConfig:
     return cfg
 
 
-def read_config(path: Path) -> dict[str, Any]:
-    """Return the configuration of a run as a dictionary; nothing in it is called or looked up."""
-    try:
-        if (size := path.stat().st_size) > MAX_BYTES:
-            raise ValueError(f"has {size:,} bytes, of {MAX_BYTES:,} at most")
-        text = path.read_text()
-        marks = yaml.AnchorToken, yaml.AliasToken  # a few lines can expand to gigabytes
-        if any(isinstance(token, marks) for token in yaml.scan(text, yaml.SafeLoader)):
-            raise ValueError("refers to parts of itself")
-        found: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
-        if not isinstance(found, dict):
-            raise ValueError("is no list of keys and values")
-        if any(isinstance(one, str) and "${" in one for _, one in validation.iter_nodes(found)):
-            raise ValueError("holds an interpolation, which no saved run does")
-    except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"{path} is not the configuration of a run: {reason}") from error
-    return found
-
-
 def checked_config(path: Path, *, trust: bool | Mapping[str, Any] = False) -> dict[str, Any]:
     """Return the configuration of a run whose objects may be called.
 
@@ -118,12 +87,6 @@ def checked_config(path: Path, *, trust: bool | Mapping[str, Any] = False) -> di
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     return found
-
-
-def options_of_run(folder: Path) -> dict[str, Any]:
-    """Return the hyperparameters of a run, see `hyperparameters`; none without configuration."""
-    path = folder / "config.yaml"
-    return hyperparameters(OmegaConf.create(read_config(path))) if path.is_file() else {}
 
 
 def load_run(
@@ -146,12 +109,7 @@ def load_run(
     """
     from dpl.training import checkpoints  # which imports Lightning
 
-    config = Path(folder) / "config.yaml"
-    kept = [Path(folder) / "checkpoints" / name for name in checkpoints.LOADABLE]
-    best = next((path for path in kept if path.exists()), kept[-1])
-    for path in (config, best):
-        if not path.is_file():
-            raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
+    config, best = files_of_run(folder)
     cfg = OmegaConf.create(checked_config(config, trust=trust))
     if not trust:
         cfg = with_own_data(cfg, Path(folder))

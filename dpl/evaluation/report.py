@@ -12,7 +12,16 @@ import torch
 from torch import Tensor
 
 from dpl.evaluation.nodal_fields import nodal_fields
-from dpl.evaluation.tables import power, share, show_cells
+from dpl.evaluation.tables import (
+    PREDICTION,
+    TOLS,
+    error_row,
+    newton_row,
+    power,
+    share,
+    show_cells,
+    simulator_row,
+)
 from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
 from dpl.fem import (
     LinearSolver,
@@ -32,8 +41,6 @@ from dpl.training import RelativeL2, Surrogate
 from dpl.training.metrics import default_metrics
 from dpl.visualization import plot_deformed
 
-PREDICTION = "prediction"  # name of the row of the bare model
-TOLS = (1e-3, 1e-6)  # relative residuals of simulator and Newton [-]
 ERRORS = (1e-3,)  # estimated relative errors of the simulator [-]
 LEAST_ERROR = 1e-12  # estimated error at which no step is made [-]
 
@@ -66,21 +73,6 @@ class SolverResult:
     ms_p99: float
     estimated_error: float = math.inf
     latency: Mapping[str, Latency] = field(default_factory=dict)
-
-
-def simulator_row(tol: float) -> str:
-    """Return the name of the row of the simulator with a tolerance."""
-    return f"sim(force, tol={power(tol)})"
-
-
-def error_row(error: float) -> str:
-    """Return the name of the row of the simulator with a tolerance for the estimated error."""
-    return f"sim(force, error={power(error)})"
-
-
-def newton_row(tol: float) -> str:
-    """Return the name of the row of Newton's method from rest to a tolerance."""
-    return f"Newton, tol={power(tol)}"
 
 
 def measure(

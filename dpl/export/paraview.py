@@ -1,6 +1,6 @@
 """Files for ParaView: forces, displacements, stresses and det F at the nodes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -25,11 +25,11 @@ class ResultRow:
     """
 
     load: int
-    young: float
-    max_displacement: float
-    max_von_mises: float
+    young: float = field(metadata={"unit": "Pa"})
+    max_displacement: float = field(metadata={"unit": "m"})
+    max_von_mises: float = field(metadata={"unit": "Pa"})
     min_det_F: float
-    error: float
+    error: float = field(metadata={"unit": "%"})
 
 
 def write_results(

@@ -23,13 +23,11 @@ from safetensors import safe_open
 from safetensors.torch import save
 
 from dpl.scene import Scene
-from dpl.system.files import atomic_write
+from dpl.system.files import LOADABLE, atomic_write
 
 WEIGHTS = ".safetensors"
 DATA = "DataModule"  # key of the state of the data module, such as a learning curve
 HEADER = ("scene", "identity", "nodes", "epoch", "global_step", DATA)  # keys of the JSON header
-# files from which a run is loaded, by priority; a short run has only its last checkpoint
-LOADABLE = (f"best{WEIGHTS}", "best.ckpt", "last.ckpt")
 RESUME_KEYS = {"loops", "callbacks", "optimizer_states", "lr_schedulers"}
 MAX_BYTES = 8e9
 

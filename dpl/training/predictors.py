@@ -129,9 +129,9 @@ class Predictor(StoredBuffers):
         count = sum(weights.numel() for weights in self.net.parameters())
         return f"{type(self.net).__name__}, {count:,} weights; loss {type(loss).__name__}"
 
-    def skipped_work(self) -> list[str]:
-        """Return the work that the network saves, one line each."""
-        return list(getattr(self.net, "skipped_work", list)())
+    def skipped_work(self, loss: Loss) -> list[str]:
+        """Return the work that network and loss save, one line each."""
+        return [*getattr(self.net, "skipped_work", list)(), *loss.skipped_work()]
 
     def check_buffers(self) -> None:
         """Raise ValueError if a scale is not positive."""
@@ -251,10 +251,10 @@ class OnLinearSolution(Predictor):
         missed = torch.where(self.problem.free, samples.displacement - linear, 0.0)
         return self.base.whiten(field), self.base.scale_outputs(missed, amplitude, scale)
 
-    def skipped_work(self) -> list[str]:
-        """Return the work that the network and the base save, one line each."""
+    def skipped_work(self, loss: Loss) -> list[str]:
+        """Return the work that network, base and loss save, one line each."""
         line = "no learning of linear elasticity: the network adds to K(0)^-1 f"
-        return [*super().skipped_work(), line]
+        return [*super().skipped_work(loss), line]
 
 
 class Fitted(Predictor):
@@ -270,6 +270,10 @@ class Fitted(Predictor):
     def describe(self, loss: Loss) -> str:
         """Return the name of the model."""
         return f"{type(self.net).__name__}, fitted by linear regression"
+
+    def skipped_work(self, loss: Loss) -> list[str]:
+        """Return the work that the model saves, one line each; the loss is not used."""
+        return list(getattr(self.net, "skipped_work", list)())
 
 
 def predictor_of(

@@ -117,7 +117,7 @@ class Surrogate(L.LightningModule):
 
     def skipped_work(self) -> list[str]:
         """Return the work that network and loss save, one line each."""
-        return [*self.predictor.skipped_work(), *self.loss.skipped_work()]
+        return self.predictor.skipped_work(self.loss)
 
     def encode(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
         """Return the training set of samples and their images, see `Predictor.dataset`."""
