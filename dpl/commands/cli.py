@@ -183,12 +183,12 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
     """
     from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
-    from dpl.training import checkpoints
+    from dpl.training import writes_loadable
 
     if cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
         _check_schedule_in_time(cfg)
     if not trainer.fast_dev_run and not any(
-        checkpoints.writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks
+        writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks
     ):
         raise ConfigError(
             "callbacks must write weights from which the run can be loaded; add "

@@ -90,6 +90,7 @@ def check(
     place = _folder(first, "run" if jobs is None else "sweep")
     every = [overrides.job(cfg) for cfg in ([first] if jobs is None else jobs)]
     for cfg in every:
+        config.check_groups(cfg)
         config.check(cfg, keys=keys)
     if jobs is not None and rehearse is not None and REMOTE not in str(first.hydra.launcher):
         different = {

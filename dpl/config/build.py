@@ -218,6 +218,17 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "training.Surrogate":
         return training.Surrogate(net, loss, scene, **predictor, **options)
 
 
+def build_trained(cfg: DictConfig, scene: Scene) -> "training.TrainedSurrogate":
+    """Return the surrogate of a configuration without its training, for weights that are loaded.
+
+    Raises a `ConfigError` that names the key if it cannot be built.
+    """
+    torch.manual_seed(cfg.get("seed", 0))
+    net, predictor = _network(cfg, scene)
+    with error_in("model"):
+        return training.TrainedSurrogate(net, scene, **predictor)
+
+
 def _network(cfg: DictConfig, scene: Scene) -> tuple[Any, dict[str, Any]]:
     """Return the network of `model`, and those of its keys that are options of the surrogate."""
     require_keys(cfg, "model")

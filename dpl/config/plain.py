@@ -6,6 +6,7 @@ missing run is reported at once.
 
 import contextlib
 import typing
+import warnings
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,29 @@ def check(
     for chosen in (roots & resolved.keys(), resolved.keys()) if roots else (resolved.keys(),):
         parts = ({key: node[key] for key in node if key in chosen} for node in (written, resolved))
         validation.check(*parts, trust=trust, keys=keys)
+
+
+def check_groups(cfg: DictConfig) -> None:
+    """Raise a `ConfigError` if a `dpl.fem.Tag` names no part of the mesh file of a configuration.
+
+    A file that cannot be read is reported by its key when the scene is built.
+    """
+    found = to_container(cfg)
+    calls = [(p, node) for p, node in validation.iter_nodes(found) if isinstance(node, dict)]
+    tags = [(p, node.get("name")) for p, node in calls if node.get("_target_") == "dpl.fem.Tag"]
+    file = dict(calls).get("mesh", {})
+    if not tags or file.get("_target_") != "dpl.fem.read_mesh":
+        return
+    from dpl.fem import Tag, read_mesh
+
+    try:
+        with warnings.catch_warnings(action="ignore"):  # printed when the scene is built
+            mesh = read_mesh(**{key: file[key] for key in file if key != "_target_"})
+    except (OSError, MemoryError, TypeError, ValueError):
+        return
+    for place, name in tags:
+        with error_in(place):
+            Tag(name).facets(mesh)
 
 
 def require_keys(cfg: DictConfig, *keys: str) -> None:

@@ -4,7 +4,7 @@ import contextlib
 import math
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +14,17 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpl import data, inference, training
 from dpl.config import validation
-from dpl.config.build import SCENE, build_scene, build_surrogate, instantiate, moduli
+from dpl.config.build import SCENE, build_scene, build_trained, instantiate, moduli
 from dpl.config.plain import files_of_run, read_config, require_keys, to_container
 from dpl.config.validation import ConfigError
 from dpl.fem import read_mesh as load_mesh
 from dpl.fem.mesh.generators import longest_side
 from dpl.scene import Scene
 from dpl.system.memory import at_most
+from dpl.training import checkpoints
 
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
+PREDICTION = (*SCENE, "fixed", "regions", "model", "seed")  # keys of a run that `load` reads
 UNUSABLE = (  # errors of a damaged checkpoint
     *(OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, ArithmeticError),
 )
@@ -71,17 +73,24 @@ def with_own_data(cfg: DictConfig, folder: Path) -> DictConfig:
     return cfg
 
 
-def checked_config(path: Path, *, trust: bool | Mapping[str, Any] = False) -> dict[str, Any]:
+def checked_config(
+    path: Path,
+    *,
+    trust: bool | Mapping[str, Any] = False,
+    keys: Collection[str] | None = None,
+) -> dict[str, Any]:
     """Return the configuration of a run whose objects may be called.
 
     Args:
         path: Its file.
         trust: Allow calls of any object, or of those of another configuration, see `check`.
+        keys: Keys to read; None for all.
 
     Raises:
         ConfigError: It cannot be read, is invalid, or calls an object that is not trusted.
     """
     found = read_config(path)
+    found = {key: node for key, node in found.items() if keys is None or key in keys}
     try:
         validation.check(found, found, trust=trust)
     except ConfigError as error:
@@ -90,8 +99,12 @@ def checked_config(path: Path, *, trust: bool | Mapping[str, Any] = False) -> di
 
 
 def load_run(
-    folder: str | Path, *, trust: bool = False, scene: Scene | None = None
-) -> tuple[DictConfig, "training.Surrogate"]:
+    folder: str | Path,
+    *,
+    trust: bool = False,
+    scene: Scene | None = None,
+    keys: Collection[str] | None = None,
+) -> tuple[DictConfig, "training.TrainedSurrogate"]:
     """Return the configuration and the best surrogate of a training run.
 
     If the run has chosen its number of training loads (`data=growing`), the number of the best fit
@@ -103,24 +116,23 @@ def load_run(
             Young's moduli of the run, which its fingerprint does not contain.
         trust: Import and call objects outside this package, such as your own law, that the
             configuration names.
+        keys: Keys of the configuration to read, at least `PREDICTION`; None for all.
 
     Raises:
         ConfigError: There is no finished run, or it names an object that is not trusted.
     """
-    from dpl.training import checkpoints  # which imports Lightning
-
     config, best = files_of_run(folder)
-    cfg = OmegaConf.create(checked_config(config, trust=trust))
+    cfg = OmegaConf.create(checked_config(config, trust=trust, keys=keys))
     if not trust:
         cfg = with_own_data(cfg, Path(folder))
     with usable(best):
         checkpoint = checkpoints.read(best)
-        if points := checkpoint.get(checkpoints.DATA, {}).get("points"):
+        if (points := checkpoint.get(checkpoints.DATA, {}).get("points")) and "data" in cfg:
             cfg.data.train = int(points[-1][0])
     scene = _scene_of_run(cfg, best, checkpoint, scene, trust=trust)
-    surrogate = build_surrogate(cfg, scene)
+    surrogate = build_trained(cfg, scene)
     with usable(best):
-        surrogate.on_load_checkpoint(checkpoint)
+        checkpoints.check_scene(checkpoint, scene)
         surrogate.load_state_dict(checkpoint["state_dict"])
         surrogate.eval().check_predictions()
     return cfg, surrogate
@@ -179,12 +191,12 @@ def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":
         ValueError: There is no finished run, its checkpoint belongs to another scene, or it names
             an object that is not trusted.
     """
-    return inference.Simulator(load_run(folder, trust=trust)[1])
+    return inference.Simulator(load_run(folder, trust=trust, keys=PREDICTION)[1])
 
 
 def load_runs(
     folder: str | Path, names: Sequence[str] | None = None, *, trust: bool = False
-) -> dict[str, tuple[DictConfig, "training.Surrogate"]]:
+) -> dict[str, tuple[DictConfig, "training.TrainedSurrogate"]]:
     """Return the configurations and surrogates of named runs in a folder, or of all.
 
     They share one scene, except runs of another size or range of Young's moduli.
@@ -196,7 +208,7 @@ def load_runs(
         names = sorted(path.parent.name for path in Path(folder).glob("*/config.yaml"))
     if not names:
         raise ConfigError(f"run = {folder} contains no runs; train some with run={folder}/NAME")
-    runs: dict[str, tuple[DictConfig, training.Surrogate]] = {}
+    runs: dict[str, tuple[DictConfig, training.TrainedSurrogate]] = {}
     scene: Scene | None = None
     for name in names:
         runs[name] = load_run(Path(folder) / name, trust=trust, scene=scene)

@@ -37,7 +37,7 @@ from dpl.fem import (
 from dpl.inference import Corrected, Direct, Hybrid, Simulator
 from dpl.scene import Sample, Scene
 from dpl.system.threads import one_thread
-from dpl.training import RelativeL2, Surrogate
+from dpl.training import RelativeL2, TrainedSurrogate
 from dpl.training.metrics import default_metrics
 from dpl.visualization import plot_deformed
 
@@ -117,7 +117,7 @@ def save(rows: Sequence[SolverResult], path: Path) -> None:
 
 
 def evaluate(
-    surrogate: Surrogate,
+    surrogate: TrainedSurrogate,
     test: Sample,
     folder: Path,
     *,
@@ -209,7 +209,7 @@ class _Simulated:
         )
 
 
-def _step_in_modes(surrogate: Surrogate, tol: float) -> dict[str, Solver]:
+def _step_in_modes(surrogate: TrainedSurrogate, tol: float) -> dict[str, Solver]:
     """Return the surrogate with one Newton step in its modes, if it has such a method."""
     newton = surrogate.predictor.correction()
     if newton is None:
@@ -228,7 +228,7 @@ def _own(scene: Scene) -> Newton:
 
 
 def _draw(
-    surrogate: Surrogate, test: Sample, displacements: Mapping[str, Tensor], folder: Path
+    surrogate: TrainedSurrogate, test: Sample, displacements: Mapping[str, Tensor], folder: Path
 ) -> None:
     """Draw the loads with minimum, median and maximum error; write the last one as VTU.
 

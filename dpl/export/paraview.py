@@ -7,7 +7,7 @@ import torch
 
 from dpl.evaluation.nodal_fields import nodal_fields
 from dpl.fem import Load, solve, write_series
-from dpl.training import Surrogate
+from dpl.training import TrainedSurrogate
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class ResultRow:
 
 
 def write_results(
-    surrogate: Surrogate, load: Load, path: Path, *, solve_reference: bool = True
+    surrogate: TrainedSurrogate, load: Load, path: Path, *, solve_reference: bool = True
 ) -> tuple[list[ResultRow], list[Path]]:
     """Write predictions as a series of VTU files, a PVD collection and an XDMF file.
 

@@ -132,7 +132,7 @@ READERS = {  # arguments of the commands that read a run
     ("command", "key"),
     zip(
         ["load", *READERS],
-        itertools.cycle(["trainer.profiler", "callbacks.more", "loads.amplitude"]),
+        itertools.cycle(["loads.amplitude", "trainer.profiler", "callbacks.more"]),
         strict=False,
     ),
 )

@@ -347,6 +347,38 @@ def test_generation_imports_neither_lightning_nor_matplotlib(tmp_path, environme
     assert "train: 3 of 3 loads accepted" in ended.stdout
 
 
+EARLY = textwrap.dedent(
+    """
+    import runpy, sys
+    for line in ("evaluate run=no", "view run=no", "export run=no", "compare run=no",
+                 "train model.widht=3"):
+        name, *sys.argv[1:] = line.split()
+        try:
+            runpy.run_path(f"{sys.argv[0]}/{name}.py", run_name="__main__")
+        except SystemExit as end:
+            print(end.code, "torch" in sys.modules)
+    from dpl.config import load_run
+    from dpl.inference import Simulator
+    print("torch" in sys.modules, "lightning" in sys.modules)
+    """
+)
+
+
+def test_errors_are_found_without_torch_and_runs_are_loaded_without_lightning(
+    tmp_path, environment
+):
+    ended = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.argv = [{str(ROOT / 'scripts')!r}]\n{EARLY}"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ended.stdout.splitlines() == ["2 False"] * 5 + ["True False"]
+    assert [line.partition(":")[0] for line in ended.stderr.splitlines()] == ["error"] * 5
+
+
 @pytest.mark.skipif(
     importlib.util.find_spec("optuna") is not None,
     reason="Optuna is installed",
