@@ -14,7 +14,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 import dpl
-from dpl import config, export
+from dpl import config, export, training
 from dpl.commands.cli import command
 from dpl.evaluation import tables
 from dpl.system.files import atomic_write
@@ -45,7 +45,7 @@ def main(cfg: DictConfig) -> None:
         export_results(cfg, surrogate, folder / "results")
 
 
-def export_model(cfg: DictConfig, surrogate: "dpl.Surrogate", folder: Path) -> None:
+def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder: Path) -> None:
     """Write the graph and its folder, compare the graph with torch, and measure latencies."""
     from dpl.export.metadata import describe, solve_reference
 
@@ -135,7 +135,7 @@ def _test_errors(folder: Path) -> dict[str, float] | None:
         ) from error
 
 
-def export_results(cfg: DictConfig, surrogate: "dpl.Surrogate", folder: Path) -> None:
+def export_results(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder: Path) -> None:
     """Write predictions for random loads as files for ParaView."""
     for old in folder.glob("results_[0-9]*.vtu"):  # an earlier series may have been longer
         old.unlink()

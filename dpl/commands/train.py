@@ -80,8 +80,8 @@ def _train(cfg: DictConfig) -> float | None:
     session = training.LogHyperparameters(config.hyperparameters(cfg, without=unused))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
-        options = {"folder": _from_here(folder), "verbose": cli.extra(cfg, "verbose")}
-        config.show_plan(scene, module, surrogate, **options)
+        verbose = cli.extra(cfg, "verbose")
+        config.show_plan(scene, module, surrogate, folder=_from_here(folder), verbose=verbose)
         if not trainer.fast_dev_run:
             config.save_config(cfg, folder)
     smallest: float | None = None
@@ -140,7 +140,7 @@ def _fit(
     return training.fit(surrogate, module, trainer=trainer, folder=kept)
 
 
-def _view(surrogate: "dpl.Surrogate", folder: Path) -> NoReturn:
+def _view(surrogate: "training.TrainedSurrogate", folder: Path) -> NoReturn:
     """Serve the page of a trained surrogate at any free port until Ctrl-C."""
     from dpl import viewer
     from dpl.commands.view import serve

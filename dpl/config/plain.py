@@ -19,6 +19,7 @@ from dpl.config import validation
 from dpl.config.validation import ConfigError
 from dpl.system.files import LOADABLE, DataSetError
 
+TAG = "dpl.fem.Tag"  # call of a region that a mesh file names
 MAX_BYTES = 100_000  # of the configuration of a run
 NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its result
     *("run", "folder", "ckpt_path", "trust", "data.folder"),
@@ -92,7 +93,7 @@ def check(
     written = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg))
     resolved = to_container(cfg)
     roots = {key.partition(".")[0] for key in first}
-    for chosen in (roots & resolved.keys(), resolved.keys()) if roots else (resolved.keys(),):
+    for chosen in filter(None, (roots & resolved.keys(), resolved.keys())):
         parts = ({key: node[key] for key in node if key in chosen} for node in (written, resolved))
         validation.check(*parts, trust=trust, keys=keys)
 
@@ -103,9 +104,9 @@ def check_groups(cfg: DictConfig) -> None:
     A file that cannot be read is reported by its key when the scene is built.
     """
     found = to_container(cfg)
-    calls = [(p, node) for p, node in validation.iter_nodes(found) if isinstance(node, dict)]
-    tags = [(p, node.get("name")) for p, node in calls if node.get("_target_") == "dpl.fem.Tag"]
-    file = dict(calls).get("mesh", {})
+    calls = {p: node for p, node in validation.iter_nodes(found) if isinstance(node, dict)}
+    tags = {p: node.get("name") for p, node in calls.items() if node.get("_target_") == TAG}
+    file = calls.get("mesh", {})
     if not tags or file.get("_target_") != "dpl.fem.read_mesh":
         return
     from dpl.fem import Tag, read_mesh
@@ -115,9 +116,9 @@ def check_groups(cfg: DictConfig) -> None:
             mesh = read_mesh(**{key: file[key] for key in file if key != "_target_"})
     except (OSError, MemoryError, TypeError, ValueError):
         return
-    for place, name in tags:
+    for place, name in tags.items():
         with error_in(place):
-            Tag(name).facets(mesh)
+            Tag(str(name)).facets(mesh)
 
 
 def require_keys(cfg: DictConfig, *keys: str) -> None:

@@ -17,7 +17,6 @@ from dpl.config import validation
 from dpl.config.build import SCENE, build_scene, build_trained, instantiate, moduli
 from dpl.config.plain import files_of_run, read_config, require_keys, to_container
 from dpl.config.validation import ConfigError
-from dpl.fem import read_mesh as load_mesh
 from dpl.fem.mesh.generators import longest_side
 from dpl.scene import Scene
 from dpl.system.memory import at_most
@@ -49,7 +48,9 @@ def with_copied_files(
     found, files = to_container(cfg), {}
     scene = {key: found[key] for key in (*SCENE, "fixed", "regions") if key in found}
     for key, call, option in list(validation.options_with_files(scene)):
-        is_mesh = hydra.utils.get_object(call["_target_"]) is load_mesh
+        from dpl.fem import read_mesh  # which imports meshio
+
+        is_mesh = hydra.utils.get_object(call["_target_"]) is read_mesh
         path = Path(call[option])
         own = folder / (MESH if is_mesh else f"{key}{path.suffix}".replace("/", "_"))
         files[key] = path, own

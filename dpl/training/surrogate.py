@@ -1,7 +1,7 @@
 """The LightningModule: a surrogate with loss, metrics and optimiser."""
 
 from collections.abc import Callable, Iterable
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import lightning as L
 import torch
@@ -27,6 +27,10 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         loss: The loss.
         physics: The part of the scene that losses need, on the device of the network.
     """
+
+    if TYPE_CHECKING:  # type checkers do not follow Lightning
+
+        def __getattr__(self, name: str) -> Any: ...
 
     def __init__(
         self,

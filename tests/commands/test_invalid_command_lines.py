@@ -12,6 +12,7 @@ from dpl.config import ConfigError, plain
 
 OPTIONS = "Available options in 'model': cnn fcnn gnn pod unrolled"
 EXPERIMENTS = "Available options in 'experiment': beam_nh_loss beam_poisson beam_svk "
+BRACKET = Path(__file__).parents[2] / "benchmarks/meshes/bracket.msh"
 NONSENSE = {  # command line -> what the one line says
     "train experiment=beam_yuong": f"Could not find 'experiment/beam_yuong' {EXPERIMENTS}",
     "generate experiment=beam_yuong": f"Could not find 'experiment/beam_yuong' {EXPERIMENTS}",
@@ -40,6 +41,9 @@ NONSENSE = {  # command line -> what the one line says
     "train --config-dir nowhere": r"^--config-dir = nowhere must be an existing folder$",
     "train --config-name nowhere": r"^Cannot find primary config 'nowhere'",
     "train young=${nowhere}": r"^young: Interpolation key 'nowhere' not found$",
+    f"train mesh=file mesh.path={BRACKET} fixed=tag fixed.name=wal": (
+        r"^fixed: Tag\(name='wal'\): the mesh has 'body', 'bore', 'seat', 'wall'"
+    ),
     "train run=null": r"^run = null must be a text",
     "train run=${nowhere}": r"^run = \$\{nowhere\} must be a text",
     "train run=/proc/nope": r"^run = /proc/nope cannot be written: No such file",

@@ -1,5 +1,6 @@
 """The commands, end to end: what a user types, and what is there afterwards."""
 
+import itertools
 import json
 import os
 import signal
@@ -188,6 +189,7 @@ def test_a_mesh_from_a_file_of_another_program_is_trained_on(script, tmp_path):
     ended = script(
         "train", "mesh=file", "mesh.path=part.msh", "loads.n_modes=2", "solver.linear=superlu",
         *sizes, "trainer.max_epochs=1", "trainer.check_val_every_n_epoch=1", "run=part",
+        "extras.verbose=true",
         cwd=tmp_path,
     )  # fmt: skip
     assert ended.status == 0, ended.err[-2000:]
@@ -361,6 +363,9 @@ def test_a_sweep_over_networks_gives_each_the_loss_that_is_asked_for_and_a_folde
         ("PODNet", "MSE", "AdamW"),
         ("PODNet", "LrStar", "AdamW"),
     }
+    pairs = itertools.product(("mse", "lr_star"), ("fcnn", "pod"))
+    names = {f"loss-{loss}_model-{model}" for loss, model in pairs}
+    assert {folder.name for folder in runs.values()} == names, "the keys that are swept, no others"
     judged = {json.loads((folder / "evaluation.json").read_text())[1]["errors"]["e_mean"]
               for folder in runs.values()}  # fmt: skip
     assert len(judged) == 4, "each run is another one"

@@ -402,6 +402,7 @@ def test_hyperparameters_are_flat_and_a_call_goes_by_its_name(compose):
     assert all(isinstance(value, bool | int | float | str) for value in flat.values())
     noise = ("run", "folder", "ckpt_path", "callbacks", "logger", "paths", "extras", "tags")
     assert not [key for key in flat if key.startswith(noise) or "_target_" in key]
+    assert flat.keys() - plain.hyperparameters(cfg, without=("loss",)).keys() >= {"loss"}
 
 
 @pytest.mark.parametrize(
