@@ -14,6 +14,7 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape  # a unit such as [m] is no markup
 from rich.table import Table
 
 from dpl.system.files import atomic_write
@@ -49,15 +50,15 @@ def show_cells(title: str, columns: Sequence[str], *sections: Sequence[Sequence[
     Words of a title stand below each other, so that columns are as narrow as their numbers.
     """
     table = Table(
-        title=title or None, title_justify="left", title_style="", box=box.SIMPLE_HEAD,
+        title=escape(title) or None, title_justify="left", title_style="", box=box.SIMPLE_HEAD,
         pad_edge=False, padding=(0, 1, 0, 0),
     )  # fmt: skip
     for number, column in enumerate(columns):
         words = column.replace(" ", "\n") if number else column
-        table.add_column(words, justify="right" if number else "left", no_wrap=True)
+        table.add_column(escape(words), justify="right" if number else "left", no_wrap=True)
     for rows in sections:
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*map(escape, row))
         table.add_section()
     Console(width=max(Console().width, 200)).print(table)
 
