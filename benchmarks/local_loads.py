@@ -19,7 +19,7 @@ from dpl.inference import Simulator
 from dpl.models import Unrolled
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
-from dpl.training import Surrogate
+from dpl.training import TrainedSurrogate
 
 DEFLECTIONS = (1e-3, 0.05)  # largest linear deflection of the local loads over L [-]
 RADIUS = 0.05  # largest radius of a patch over L [-]
@@ -66,7 +66,7 @@ class LocalLoads:
     onnx_error: float | None = None
 
 
-def measure(surrogate: Surrogate, count: int, *, repeats: int = 1) -> Iterator[LocalLoads]:
+def measure(surrogate: TrainedSurrogate, count: int, *, repeats: int = 1) -> Iterator[LocalLoads]:
     """Yield the rows of local loads and of the loads of the run.
 
     Args:
@@ -142,7 +142,7 @@ def _graph_numbers(
     return {"onnx_p50": times.p50, "onnx_p99": times.p99, "onnx_error": difference}
 
 
-def linear_solution(surrogate: Surrogate, load: Load) -> Tensor:
+def linear_solution(surrogate: TrainedSurrogate, load: Load) -> Tensor:
     """Return the linear solution that a fitted `Unrolled` uses, (1, N, D) [-]."""
     problem, net = surrogate.scene.problem, cast(Unrolled, surrogate.net)
     field = problem.prescribed.clone()[None]

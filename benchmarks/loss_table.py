@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.methods import training_minutes
-from dpl.evaluation.report import PREDICTION
+from dpl.evaluation.tables import PREDICTION
 from dpl.training.metrics import median
 
 METRICS = ("e_mean", "e_max", "SNR_min", "rel_L2_median", "rel_L2_worst", "residual")

@@ -13,7 +13,7 @@ from benchmarks.pod_galerkin import PODGalerkin
 from dpl.fem import Load, SubspaceNewton
 from dpl.inference.hybrid import Predict
 from dpl.scene import Sample, Scene
-from dpl.training import Surrogate
+from dpl.training import TrainedSurrogate
 
 CELL_STATES = 256  # states at which the cells of hyper-reduction are chosen
 
@@ -68,14 +68,20 @@ def pod_galerkin(scene: Scene, train: Sample, *, rank: int, tolerance: float) ->
     return Method(predict, len(train.force), minutes)
 
 
-def network(surrogate: Surrogate, folder: Path, samples: int | None) -> Method:
+def network(surrogate: TrainedSurrogate, folder: Path, samples: int | None) -> Method:
     """Return the network of the run in a folder."""
     count = sum(p.numel() for p in surrogate.net.parameters())
     return Method(surrogate.predict, samples, training_minutes(folder), count)
 
 
 def corrected(
-    surrogate: Surrogate, method: Method, train: Sample, *, rank: int, tolerance: float, steps: int
+    surrogate: TrainedSurrogate,
+    method: Method,
+    train: Sample,
+    *,
+    rank: int,
+    tolerance: float,
+    steps: int,
 ) -> Method:
     """Return a network whose predictions are corrected by Newton iterations in its modes.
 

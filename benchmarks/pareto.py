@@ -15,7 +15,7 @@ from dpl.evaluation.timing import WARM_UP, percentiles
 from dpl.fem import Load, Solution, Solver, solve
 from dpl.scene import Sample
 from dpl.system.threads import one_thread
-from dpl.training import RelativeL2, Surrogate
+from dpl.training import RelativeL2, TrainedSurrogate
 from dpl.training.metrics import median
 from dpl.visualization import method_colours
 
@@ -139,7 +139,7 @@ def _threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def on_gpu(surrogate: Surrogate) -> Callable[[Load], Tensor]:
+def on_gpu(surrogate: TrainedSurrogate) -> Callable[[Load], Tensor]:
     """Return the prediction of a surrogate on the GPU, with copies from and to the CPU."""
     device = torch.device("cuda")
     on_device = surrogate.to(device)

@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 from threadpoolctl import threadpool_limits
 
 from dpl import Sample, Scene
-from dpl.config import build
+from dpl.config import build, plain
 from dpl.data import DataModule
 from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box
 
@@ -158,7 +158,7 @@ def scene_of(compose) -> Callable[..., Scene]:
 
     def scene_of(*overrides: str) -> Scene:
         cfg = compose(*overrides)
-        build.check(cfg)
+        plain.check(cfg)
         return build.build_scene(cfg)
 
     return scene_of

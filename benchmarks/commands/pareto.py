@@ -10,7 +10,7 @@ from rich.progress import Progress
 
 import dpl
 from benchmarks.commands import CONF
-from dpl import config, fem, inference
+from dpl import config, fem, inference, training
 from dpl.commands.cli import command
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def _solvers(cfg: DictConfig) -> tuple["dpl.Scene", dict[str, "fem.Solver"], "dp
 
 def trained_methods(
     cfg: DictConfig,
-    runs: "Mapping[str, tuple[DictConfig, dpl.Surrogate]]",
+    runs: "Mapping[str, tuple[DictConfig, training.TrainedSurrogate]]",
     data: "dpl.DataModule",
 ) -> dict[tuple[str, str], "Method"]:
     """Return POD-Galerkin, the networks and the corrected networks, by name and variant.

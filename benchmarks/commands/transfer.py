@@ -17,7 +17,7 @@ from dpl.commands.cli import command
 if TYPE_CHECKING:
     from benchmarks.transfer import Transfer
     from dpl import Sample
-    from dpl.training import Surrogate
+    from dpl.training import TrainedSurrogate
 
 KEYS = ((Sequence[str] | None, "families"), (str, "name"), (int, "count", 1, 10**6))
 
@@ -46,7 +46,7 @@ def main(cfg: DictConfig) -> None:
     record(rows(), stem, "networks on the loads of other families, 1 thread", transfer.draw)
 
 
-def _runs(cfg: DictConfig) -> "dict[str, dict[str, tuple[DictConfig, Surrogate]]]":
+def _runs(cfg: DictConfig) -> "dict[str, dict[str, tuple[DictConfig, TrainedSurrogate]]]":
     """Return configurations and surrogates by family and network."""
     found = {path.parents[1].name for path in Path(cfg.run).glob("*/*/config.yaml")}
     if not found:
@@ -57,7 +57,7 @@ def _runs(cfg: DictConfig) -> "dict[str, dict[str, tuple[DictConfig, Surrogate]]
     return {name: config.load_runs(Path(cfg.run) / name, cfg.networks) for name in families}
 
 
-def _test_loads(cfg: DictConfig, surrogate: "Surrogate", count: int) -> "Sample":
+def _test_loads(cfg: DictConfig, surrogate: "TrainedSurrogate", count: int) -> "Sample":
     """Return the first test loads of the data set of a run, with their solutions."""
     from benchmarks.samples import first
 

@@ -15,7 +15,7 @@ from dpl import Scene
 from dpl.fem import Load, Solution
 from dpl.inference import Answer, Simulator, default_hybrid
 from dpl.inference.answer import ROUNDOFF
-from dpl.training import Surrogate
+from dpl.training import TrainedSurrogate
 
 AMPLITUDES = (1e-9, 1e-6, 1e-3, 0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 25.0)  # over the training range
 STREAM = (0, 11)  # random stream of these loads
@@ -45,7 +45,7 @@ class AmplitudeSweep:
         auditor: Checks Newton's states.
     """
 
-    surrogate: Surrogate
+    surrogate: TrainedSurrogate
     count: int = 2
     amplitudes: tuple[float, ...] = AMPLITUDES
     auditor: Auditor = field(default_factory=Auditor)
@@ -204,7 +204,7 @@ def _summary(levels: list[LoadLevel], methods: list[str]) -> str:
     return f"largest error at amplitude {shown}; answered by {used}"
 
 
-def cases(surrogate: Surrogate, *, count: int = 2) -> list[Case]:
+def cases(surrogate: TrainedSurrogate, *, count: int = 2) -> list[Case]:
     """Return the cases of a trained surrogate.
 
     Args:

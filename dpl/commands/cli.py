@@ -6,6 +6,7 @@ import functools
 import logging
 import math
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
 from dpl import config
@@ -24,6 +25,10 @@ from dpl.config import CONF, ConfigError, Keys
 from dpl.system.files import DataSetError
 from dpl.version import install
 
+# turns overrides into the name of a folder that needs quotes in no command line
+OmegaConf.register_new_resolver(
+    "dpl.name", lambda text: re.sub(r"[^\w.]+", "-", text).strip("-"), replace=True
+)
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
@@ -141,12 +146,16 @@ def _drop_empty(folder: Path) -> None:
             folder = folder.parent
 
 
+def extra(cfg: DictConfig, name: str) -> bool:
+    """Return an option of `extras`; False if it is absent."""
+    return bool((cfg.get("extras") or {}).get(name))
+
+
 def check_extras(cfg: DictConfig) -> None:
     """Raise a `ConfigError` if `extras` needs tags that are missing or a viewer that cannot run."""
-    extras = cfg.get("extras") or {}
-    if extras.get("enforce_tags") and not cfg.tags:
+    if extra(cfg, "enforce_tags") and not cfg.tags:
         raise ConfigError("tags = [] must name one tag or more; or set extras.enforce_tags=false")
-    if extras.get("view"):
+    if extra(cfg, "view"):
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             raise ConfigError("extras.view = true needs one run; leave it out of a sweep")
         require_viewer()
@@ -174,12 +183,12 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
     """
     from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
-    from dpl.training import checkpoints
+    from dpl.training import writes_loadable
 
     if cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
         _check_schedule_in_time(cfg)
     if not trainer.fast_dev_run and not any(
-        checkpoints.writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks
+        writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks
     ):
         raise ConfigError(
             "callbacks must write weights from which the run can be loaded; add "

@@ -24,6 +24,7 @@ from dpl.config import ConfigError
 
 BASIC = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
 REMOTE = "submitit"  # launchers on other machines, whose hardware may differ
+BODY = ("mesh", "fixed", "regions", "supports", "forces", "loads")  # keys that may name groups
 SAME = ("seed", "run", "folder")  # keys on which the validity of a job does not depend
 
 
@@ -89,6 +90,9 @@ def check(
         return None
     place = _folder(first, "run" if jobs is None else "sweep")
     every = [overrides.job(cfg) for cfg in ([first] if jobs is None else jobs)]
+    bodies = {str(OmegaConf.masked_copy(cfg, BODY)): cfg for cfg in every}
+    for cfg in bodies.values():
+        config.check_groups(cfg)
     for cfg in every:
         config.check(cfg, keys=keys)
     if jobs is not None and rehearse is not None and REMOTE not in str(first.hydra.launcher):
@@ -109,9 +113,15 @@ def check(
 def run(
     engine: Hydra, args: Namespace, task: Callable[[DictConfig], Any], cfg: DictConfig | None
 ) -> None:
-    """Run the jobs of a command line; `cfg` is the result of `check`."""
+    """Run the jobs of a command line; `cfg` is the result of `check`.
+
+    The folders of the jobs of a sweep are named by the keys that are swept.
+    """
     if cfg is None:
-        lines = [*args.overrides, "hydra.mode=MULTIRUN"]
+        every = map(overrides.parsed, args.overrides)
+        fixed = [f"'{one.key_or_group}'" for one in every if not one.is_sweep_override()]
+        names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]"
+        lines = [*args.overrides, "hydra.mode=MULTIRUN", names]
         run_and_report(lambda: engine.multirun(args.config_name, task, lines))
     else:
         configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)

@@ -14,7 +14,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 import dpl
-from dpl import config, export
+from dpl import config, export, training
 from dpl.commands.cli import command
 from dpl.evaluation import tables
 from dpl.system.files import atomic_write
@@ -26,12 +26,13 @@ RESULT_STREAM = (0, 12)  # random stream of the loads in results
 @command("export")
 def main(cfg: DictConfig) -> None:
     """Write the parts that `outputs` names."""
-    from dpl.export.onnx_graph import missing_packages
-
     if not cfg.outputs:
         raise config.ConfigError("outputs = [] must contain one of model, results")
     if "results" in cfg.outputs and cfg.count < 1:
         raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or use outputs=[model]")
+    config.files_of_run(cfg.run)  # refuses a missing run before torch is imported
+    from dpl.export.onnx_graph import missing_packages
+
     if "model" in cfg.outputs and (absent := missing_packages()):
         raise config.ConfigError(
             f"outputs: model needs {', '.join(absent)}: {install('onnx')}, or use outputs=[results]"
@@ -44,7 +45,7 @@ def main(cfg: DictConfig) -> None:
         export_results(cfg, surrogate, folder / "results")
 
 
-def export_model(cfg: DictConfig, surrogate: "dpl.Surrogate", folder: Path) -> None:
+def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder: Path) -> None:
     """Write the graph and its folder, compare the graph with torch, and measure latencies."""
     from dpl.export.metadata import describe, solve_reference
 
@@ -134,7 +135,7 @@ def _test_errors(folder: Path) -> dict[str, float] | None:
         ) from error
 
 
-def export_results(cfg: DictConfig, surrogate: "dpl.Surrogate", folder: Path) -> None:
+def export_results(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder: Path) -> None:
     """Write predictions for random loads as files for ParaView."""
     for old in folder.glob("results_[0-9]*.vtu"):  # an earlier series may have been longer
         old.unlink()

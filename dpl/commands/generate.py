@@ -6,7 +6,7 @@ from omegaconf import DictConfig
 
 import dpl
 from dpl import config
-from dpl.commands.cli import command
+from dpl.commands.cli import command, extra
 
 
 def parts(cfg: DictConfig) -> tuple["dpl.Scene", "dpl.DataSet"]:
@@ -19,7 +19,7 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", "dpl.DataSet"]:
 def main(cfg: DictConfig) -> None:
     """Generate the missing loads of a data set, or verify or repair it."""
     scene, data = parts(cfg)
-    config.show_plan(scene, data)
+    config.show_plan(scene, data, verbose=extra(cfg, "verbose"))
     if cfg.action == "verify":
         flaws = list(data.verify())
         print(data.store.summary())

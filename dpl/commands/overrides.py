@@ -3,6 +3,8 @@
 All functions need an initialised Hydra (`dpl.commands.dry_run.initialized`).
 """
 
+import difflib
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,6 +24,7 @@ from dpl.config import ConfigError, validation
 from dpl.version import install
 
 EXTRAS = {"hydra/launcher": "launch", "hydra/sweeper": "sweep"}  # groups with options of plugins
+SIMILAR = 0.8  # ratio of `difflib` from which a key is taken for a misspelt one
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, AssertionError, TypeError)
 
 
@@ -69,6 +72,7 @@ def composed(name: str, lines: Sequence[str]) -> DictConfig:
             cfg = hydra.compose(name, overrides=forced, return_hydra_config=True)
         except REFUSED:
             raise refusal from error
+        _check_spelling(cfg, str(error))
     added = [line for line in lines if line[0] != "~" and (line[0] == "+" or refusal)]
     keys = {line.lstrip("+").partition("=")[0] for line in added}
     if new := {key for key in keys if "." not in key and not options(name, key)}:
@@ -77,7 +81,7 @@ def composed(name: str, lines: Sequence[str]) -> DictConfig:
             message = validation.suggestion(key, known)
             raise ConfigError(f"{key}: this command has no such key; {message}")
     if refusal is not None:
-        config.check(job(cfg), keys=[(object, " ".join(map(str, cfg)))])
+        config.check(job(cfg), keys=[(object, " ".join(map(str, cfg)))], first=keys)
         raise refusal
     return cfg
 
@@ -88,6 +92,19 @@ def job(cfg: DictConfig) -> DictConfig:
     if "folder" in found and OmegaConf.is_interpolation(found, "folder"):
         found.folder = "."
     return found
+
+
+def _check_spelling(cfg: DictConfig, message: str) -> None:
+    """Raise a `ConfigError` if the key that Hydra refuses resembles a key of the same node.
+
+    Nothing that the configuration names is imported for this.
+    """
+    if found := re.match(r"Could not override '(([\w.]+)\.(\w+))'", message):
+        node = OmegaConf.select(cfg, found[2])
+        known = {str(key) for key in node} - {found[3]} if isinstance(node, DictConfig) else set()
+        if near := difflib.get_close_matches(found[3], known, 1, SIMILAR):
+            place = f"{found[2]}.{near[0]}"
+            raise ConfigError(f"{found[1]}: there is no such key; did you mean {place}?")
 
 
 def _with_force(name: str, one: Override) -> str:

@@ -17,6 +17,8 @@ from dpl import config, data, evaluation, training
 from dpl.commands import cli
 from dpl.system.files import DataSetError
 
+OF_GRADIENT_DESCENT = ("loss", "optimizer", "scheduler", "trainer")  # keys that a fit ignores
+
 
 def parts(cfg: DictConfig) -> tuple["dpl.Scene", "data.DataModule", "dpl.Surrogate", Any]:
     """Return scene, data, surrogate and trainer of a run without solving or writing."""
@@ -74,12 +76,12 @@ def _train(cfg: DictConfig) -> float | None:
 
     folder = Path(cfg.folder)
     scene, module, surrogate, trainer = parts(cfg)
-    session = training.LogHyperparameters(config.hyperparameters(cfg))
+    unused = OF_GRADIENT_DESCENT if surrogate.predictor.is_closed_form else ()
+    session = training.LogHyperparameters(config.hyperparameters(cfg, without=unused))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
-        hydra = HydraConfig.get()
-        first = hydra.mode != RunMode.MULTIRUN or hydra.job.num == 0
-        config.show_plan(scene, module, surrogate, folder=_from_here(folder), skipped=first)
+        verbose = cli.extra(cfg, "verbose")
+        config.show_plan(scene, module, surrogate, folder=_from_here(folder), verbose=verbose)
         if not trainer.fast_dev_run:
             config.save_config(cfg, folder)
     smallest: float | None = None
@@ -123,7 +125,7 @@ def _train(cfg: DictConfig) -> float | None:
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         logs = any(isinstance(one, TensorBoardLogger) for one in trainer.loggers)
         show_next_commands(folder, tensorboard=logs)
-    if (cfg.get("extras") or {}).get("view"):
+    if cli.extra(cfg, "view"):
         _view(best, folder)
     return cli.best_error(trainer) if smallest is None else smallest
 
@@ -138,7 +140,7 @@ def _fit(
     return training.fit(surrogate, module, trainer=trainer, folder=kept)
 
 
-def _view(surrogate: "dpl.Surrogate", folder: Path) -> NoReturn:
+def _view(surrogate: "training.TrainedSurrogate", folder: Path) -> NoReturn:
     """Serve the page of a trained surrogate at any free port until Ctrl-C."""
     from dpl import viewer
     from dpl.commands.view import serve

@@ -17,6 +17,7 @@ from dpl.version import install
 @command("view")
 def main(cfg: DictConfig) -> None:
     """Serve the page until Ctrl-C; with `animation` write an animation instead."""
+    config.files_of_run(cfg.run)  # refuses a missing run before torch is imported
     if cfg.animation:
         write_animation(load_body(cfg), Path(cfg.animation))
         return

@@ -9,11 +9,16 @@ if TYPE_CHECKING:
         build_scene,
         build_surrogate,
         build_trainer,
-        check,
-        error_in,
-        hyperparameters,
         instantiate,
         show_plan,
+    )
+    from dpl.config.plain import (
+        check,
+        check_groups,
+        error_in,
+        files_of_run,
+        hyperparameters,
+        options_of_run,
         to_container,
     )
     from dpl.config.resume import (
@@ -28,7 +33,6 @@ if TYPE_CHECKING:
         load_data,
         load_run,
         load_runs,
-        options_of_run,
         training_loads,
     )
     from dpl.config.validation import ConfigError, Keys

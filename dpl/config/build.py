@@ -20,18 +20,17 @@ import skfem
 import torch
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from torch import Tensor
 
 from dpl import models, training
 from dpl.config import validation
+from dpl.config.plain import error_in, require_keys
 from dpl.config.validation import ConfigError
 from dpl.fem import ParameterRange, Problem, SingularMatrix
 from dpl.fem.assembly.follower_loads import FollowerLoad
 from dpl.fem.units import Units
 from dpl.scene import Scene
 from dpl.system.blas import slow_blas
-from dpl.system.files import DataSetError
 
 if typing.TYPE_CHECKING:
     import lightning as L
@@ -41,72 +40,12 @@ SCENE = (  # keys of a scene; those of a surrogate
     *("material", "young", "loads", "solver"),
 )
 NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
-NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its result
-    *("run", "folder", "ckpt_path", "trust", "data.folder"),
-    *("callbacks", "logger", "paths", "extras", "trainer.plugins"),
-}
 TIME = re.compile(r"(?:(\d+):)?(\d+):(\d\d):(\d\d)")  # [DD:]HH:MM:SS
 WIDTH = 100  # characters of a line of the plan
 CANNOT_BE_MADE = (  # errors of a call with invalid arguments
     *(InstantiationException, ValueError, TypeError, ArithmeticError, LookupError),
     *(RuntimeError, MemoryError, OSError),
 )
-
-
-@contextlib.contextmanager
-def error_in(key: str, *kinds: type[Exception]) -> Iterator[None]:
-    """Turn a ValueError, or errors of these kinds, into a `ConfigError` that names a key.
-
-    A `ConfigError` and a `DataSetError` remain what they are: their messages name the place.
-    """
-    kinds = kinds or (ValueError,)
-    try:
-        yield
-    except (ConfigError, DataSetError):
-        raise
-    except kinds as error:
-        raise ConfigError(f"{key}: {error}") from error
-
-
-def to_container(cfg: DictConfig) -> dict[str, Any]:
-    """Return a configuration without interpolations; raise a `ConfigError` for a missing value."""
-    try:
-        return typing.cast(
-            "dict[str, Any]", OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
-        )
-    except MissingMandatoryValue as error:
-        raise ConfigError(f"{error.full_key} is missing; set it on the command line") from None
-    except OmegaConfBaseException as error:
-        message = str(error.msg or error).splitlines()[0]
-        raise ConfigError(f"{error.full_key or 'config'}: {message}") from None
-
-
-def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
-    """Return the hyperparameters of a run, flat: keys of the command line and their values.
-
-    A call has the key of its node and the name of its class (`model`: FCNN). Null, empty lists and
-    `NOT_IDENTITY` are left out.
-    """
-    return dict(_columns(to_container(cfg), ""))
-
-
-def _columns(node: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
-    for key, value in node.items():
-        place = f"{path}.{key}" if path else key
-        if value in (None, []) or place in NOT_IDENTITY:
-            continue
-        if isinstance(value, dict):
-            yield from _columns(value, place)
-        elif key == "_target_":
-            yield path, value.rpartition(".")[2]
-        elif not key.startswith("_"):
-            yield place, str(value) if isinstance(value, list) else value
-
-
-def check(cfg: DictConfig, *, trust: bool = True, keys: validation.Keys = ()) -> None:
-    """Check a configuration without calling anything, see `dpl.config.validation.check`."""
-    written = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg))
-    validation.check(written, to_container(cfg), trust=trust, keys=keys)
 
 
 def instantiate(cfg: DictConfig, key: str, /, **more: Any) -> Any:
@@ -152,13 +91,6 @@ def _of_kind(made: Any, key: str, place: str) -> Any:
     raise ConfigError(
         f"{place} gives an object of {type(made).__name__}; it must give {', '.join(message)}"
     )
-
-
-def require_keys(cfg: DictConfig, *keys: str) -> None:
-    """Raise a `ConfigError` if a key does not exist."""
-    for key in keys:
-        if key not in cfg:
-            raise ConfigError(f"{key} is missing")
 
 
 def build_scene(cfg: DictConfig) -> Scene:
@@ -286,6 +218,17 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "training.Surrogate":
         return training.Surrogate(net, loss, scene, **predictor, **options)
 
 
+def build_trained(cfg: DictConfig, scene: Scene) -> "training.TrainedSurrogate":
+    """Return the surrogate of a configuration without its training, for weights that are loaded.
+
+    Raises a `ConfigError` that names the key if it cannot be built.
+    """
+    torch.manual_seed(cfg.get("seed", 0))
+    net, predictor = _network(cfg, scene)
+    with error_in("model"):
+        return training.TrainedSurrogate(net, scene, **predictor)
+
+
 def _network(cfg: DictConfig, scene: Scene) -> tuple[Any, dict[str, Any]]:
     """Return the network of `model`, and those of its keys that are options of the surrogate."""
     require_keys(cfg, "model")
@@ -330,24 +273,24 @@ def _time_limit(limit: str | DictConfig) -> datetime.timedelta:
     return time
 
 
-def show_plan(scene: Scene, *parts: Any, folder: str | None = None, skipped: bool = True) -> None:
-    """Print what a run computes, where it is written, and the work that it skips.
+def show_plan(scene: Scene, *parts: Any, folder: str | None = None, verbose: bool = False) -> None:
+    """Print what a run computes and where it is written.
 
     Args:
         scene: The scene.
         *parts: Further objects whose work is described, such as data and surrogate.
         folder: Folder of the run.
-        skipped: Print the work that is skipped.
+        verbose: List the computations that are skipped; otherwise they are counted.
     """
     described = [pair for part in (scene, *parts) for pair in getattr(part, "describe", list)()]
     if folder is not None:
         described.append(("run", folder))
+    lines = [line for part in (scene, *parts) for line in part.skipped_work()]
+    how = "" if verbose else "; extras.verbose=true lists them"
+    described.append(("skipped", f"{len(lines)} computations that this scene does not need{how}"))
     for name, text in described:
         print(f"{name:<9} {text}")
-    lines = [line for part in (scene, *parts) for line in part.skipped_work()]
-    if skipped:
-        print("skipped, because this scene does not need it:")
-    for line in lines if skipped else ():
+    for line in lines if verbose else ():
         print(textwrap.fill(line, WIDTH, initial_indent="  - ", subsequent_indent="    "))
     sys.stdout.flush()
     if advice := slow_blas():

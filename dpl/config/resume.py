@@ -11,11 +11,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpl import training
 from dpl.config import validation
-from dpl.config.build import NOT_IDENTITY, error_in, instantiate, to_container
+from dpl.config.build import instantiate
+from dpl.config.plain import NOT_IDENTITY, error_in, read_config, to_container
 from dpl.config.run_folder import (
     MESH,
     checked_config,
-    read_config,
     with_copied_files,
     with_own_data,
 )

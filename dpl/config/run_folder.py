@@ -4,36 +4,26 @@ import contextlib
 import math
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
-import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from dpl import data, inference, training
 from dpl.config import validation
-from dpl.config.build import (
-    SCENE,
-    build_scene,
-    build_surrogate,
-    hyperparameters,
-    instantiate,
-    moduli,
-    require_keys,
-    to_container,
-)
+from dpl.config.build import SCENE, build_scene, build_trained, instantiate, moduli
+from dpl.config.plain import files_of_run, read_config, require_keys, to_container
 from dpl.config.validation import ConfigError
-from dpl.fem import read_mesh as load_mesh
 from dpl.fem.mesh.generators import longest_side
 from dpl.scene import Scene
 from dpl.system.memory import at_most
+from dpl.training import checkpoints
 
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
-MAX_BYTES = 100_000  # of the configuration of a run
+PREDICTION = (*SCENE, "fixed", "regions", "model", "seed")  # keys of a run that `load` reads
 UNUSABLE = (  # errors of a damaged checkpoint
     *(OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, ArithmeticError),
 )
@@ -58,7 +48,9 @@ def with_copied_files(
     found, files = to_container(cfg), {}
     scene = {key: found[key] for key in (*SCENE, "fixed", "regions") if key in found}
     for key, call, option in list(validation.options_with_files(scene)):
-        is_mesh = hydra.utils.get_object(call["_target_"]) is load_mesh
+        from dpl.fem import read_mesh  # which imports meshio
+
+        is_mesh = hydra.utils.get_object(call["_target_"]) is read_mesh
         path = Path(call[option])
         own = folder / (MESH if is_mesh else f"{key}{path.suffix}".replace("/", "_"))
         files[key] = path, own
@@ -82,37 +74,24 @@ def with_own_data(cfg: DictConfig, folder: Path) -> DictConfig:
     return cfg
 
 
-def read_config(path: Path) -> dict[str, Any]:
-    """Return the configuration of a run as a dictionary; nothing in it is called or looked up."""
-    try:
-        if (size := path.stat().st_size) > MAX_BYTES:
-            raise ValueError(f"has {size:,} bytes, of {MAX_BYTES:,} at most")
-        text = path.read_text()
-        marks = yaml.AnchorToken, yaml.AliasToken  # a few lines can expand to gigabytes
-        if any(isinstance(token, marks) for token in yaml.scan(text, yaml.SafeLoader)):
-            raise ValueError("refers to parts of itself")
-        found: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
-        if not isinstance(found, dict):
-            raise ValueError("is no list of keys and values")
-        if any(isinstance(one, str) and "${" in one for _, one in validation.iter_nodes(found)):
-            raise ValueError("holds an interpolation, which no saved run does")
-    except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"{path} is not the configuration of a run: {reason}") from error
-    return found
-
-
-def checked_config(path: Path, *, trust: bool | Mapping[str, Any] = False) -> dict[str, Any]:
+def checked_config(
+    path: Path,
+    *,
+    trust: bool | Mapping[str, Any] = False,
+    keys: Collection[str] | None = None,
+) -> dict[str, Any]:
     """Return the configuration of a run whose objects may be called.
 
     Args:
         path: Its file.
         trust: Allow calls of any object, or of those of another configuration, see `check`.
+        keys: Keys to read; None for all.
 
     Raises:
         ConfigError: It cannot be read, is invalid, or calls an object that is not trusted.
     """
     found = read_config(path)
+    found = {key: node for key, node in found.items() if keys is None or key in keys}
     try:
         validation.check(found, found, trust=trust)
     except ConfigError as error:
@@ -120,15 +99,13 @@ def checked_config(path: Path, *, trust: bool | Mapping[str, Any] = False) -> di
     return found
 
 
-def options_of_run(folder: Path) -> dict[str, Any]:
-    """Return the hyperparameters of a run, see `hyperparameters`; none without configuration."""
-    path = folder / "config.yaml"
-    return hyperparameters(OmegaConf.create(read_config(path))) if path.is_file() else {}
-
-
 def load_run(
-    folder: str | Path, *, trust: bool = False, scene: Scene | None = None
-) -> tuple[DictConfig, "training.Surrogate"]:
+    folder: str | Path,
+    *,
+    trust: bool = False,
+    scene: Scene | None = None,
+    keys: Collection[str] | None = None,
+) -> tuple[DictConfig, "training.TrainedSurrogate"]:
     """Return the configuration and the best surrogate of a training run.
 
     If the run has chosen its number of training loads (`data=growing`), the number of the best fit
@@ -140,29 +117,23 @@ def load_run(
             Young's moduli of the run, which its fingerprint does not contain.
         trust: Import and call objects outside this package, such as your own law, that the
             configuration names.
+        keys: Keys of the configuration to read, at least `PREDICTION`; None for all.
 
     Raises:
         ConfigError: There is no finished run, or it names an object that is not trusted.
     """
-    from dpl.training import checkpoints  # which imports Lightning
-
-    config = Path(folder) / "config.yaml"
-    kept = [Path(folder) / "checkpoints" / name for name in checkpoints.LOADABLE]
-    best = next((path for path in kept if path.exists()), kept[-1])
-    for path in (config, best):
-        if not path.is_file():
-            raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
-    cfg = OmegaConf.create(checked_config(config, trust=trust))
+    config, best = files_of_run(folder)
+    cfg = OmegaConf.create(checked_config(config, trust=trust, keys=keys))
     if not trust:
         cfg = with_own_data(cfg, Path(folder))
     with usable(best):
         checkpoint = checkpoints.read(best)
-        if points := checkpoint.get(checkpoints.DATA, {}).get("points"):
+        if (points := checkpoint.get(checkpoints.DATA, {}).get("points")) and "data" in cfg:
             cfg.data.train = int(points[-1][0])
     scene = _scene_of_run(cfg, best, checkpoint, scene, trust=trust)
-    surrogate = build_surrogate(cfg, scene)
+    surrogate = build_trained(cfg, scene)
     with usable(best):
-        surrogate.on_load_checkpoint(checkpoint)
+        checkpoints.check_scene(checkpoint, scene)
         surrogate.load_state_dict(checkpoint["state_dict"])
         surrogate.eval().check_predictions()
     return cfg, surrogate
@@ -221,12 +192,12 @@ def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":
         ValueError: There is no finished run, its checkpoint belongs to another scene, or it names
             an object that is not trusted.
     """
-    return inference.Simulator(load_run(folder, trust=trust)[1])
+    return inference.Simulator(load_run(folder, trust=trust, keys=PREDICTION)[1])
 
 
 def load_runs(
     folder: str | Path, names: Sequence[str] | None = None, *, trust: bool = False
-) -> dict[str, tuple[DictConfig, "training.Surrogate"]]:
+) -> dict[str, tuple[DictConfig, "training.TrainedSurrogate"]]:
     """Return the configurations and surrogates of named runs in a folder, or of all.
 
     They share one scene, except runs of another size or range of Young's moduli.
@@ -238,7 +209,7 @@ def load_runs(
         names = sorted(path.parent.name for path in Path(folder).glob("*/config.yaml"))
     if not names:
         raise ConfigError(f"run = {folder} contains no runs; train some with run={folder}/NAME")
-    runs: dict[str, tuple[DictConfig, training.Surrogate]] = {}
+    runs: dict[str, tuple[DictConfig, training.TrainedSurrogate]] = {}
     scene: Scene | None = None
     for name in names:
         runs[name] = load_run(Path(folder) / name, trust=trust, scene=scene)

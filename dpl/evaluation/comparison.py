@@ -1,27 +1,33 @@
-"""Table of evaluated runs, named by the options in which they differ."""
+"""Table of evaluated runs, with a column for each option in which they differ."""
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 
 from dpl import config
-from dpl.evaluation.report import PREDICTION, TOLS, newton_row, simulator_row
-from dpl.evaluation.tables import power, share, show_cells
-from dpl.evaluation.timing import SIMULATOR
-from dpl.training.metrics import median
+from dpl.evaluation.tables import (
+    PREDICTION,
+    SIMULATOR,
+    TOLS,
+    newton_row,
+    power,
+    share,
+    show_cells,
+    simulator_row,
+)
 
-SEED = re.compile(r",?\s*seed=\d+")
-MAX_NAME = 34  # characters of the name of a run
+WIDTH = 100  # columns of the terminal that the table fits
+MIN_NAME = 16  # characters of the name of a run, beside which there is room for options
+MAX_VALUE = 16  # characters of the value of an option
 ERRORS = ("rel_L2_median", "rel_L2_worst", "e_mean")
 
 
 def compare(folder: Path) -> None:
-    """Print errors and times of all evaluated runs below a folder.
+    """Print options, errors and times of all evaluated runs below a folder.
 
     Runs that differ only in `seed` form a group, for which medians are printed. The times are
     those of `sim(force, tol=...)` over those of Newton's method from rest to the same residual.
@@ -33,30 +39,39 @@ def compare(folder: Path) -> None:
     found = sorted(folder.rglob("evaluation.json"))
     if not found:
         raise FileNotFoundError(f"{folder} contains no evaluated run")
+    names = [str(path.parent.relative_to(folder)) for path in found]
     options = [config.options_of_run(path.parent) for path in found]
-    names = run_names([str(path.parent.relative_to(folder)) for path in found], options)
-    runs: list[list[str]] = []
-    groups: dict[str, list[tuple[str, list[float]]]] = {}
-    for path, name, own in zip(found, names, options, strict=True):
-        rows = {row["solver"]: row for row in json.loads(path.read_text())}
-        if PREDICTION not in rows:
-            raise ValueError(f"{path} has no row {PREDICTION}; run evaluate.py run={path.parent}")
-        numbers = _numbers(rows)
-        runs.append([_short(name), *_cells(numbers)])
-        groups.setdefault(_group(name, own), []).append((name, numbers))
-    medians = []
-    for members in groups.values():
-        if len(members) > 1:
-            name = SEED.sub("", members[0][0]).strip(", :")
-            middle = median(torch.tensor([numbers for _, numbers in members])).tolist()
-            medians.append([_short(f"median of {len(members)}: {name}"), *_cells(middle)])
-    times = [f"sim/Newton tol={power(tol)}" for tol in TOLS]
-    columns = ("", "median error", "worst error", "e_mean", "ms sim(force)", *times)
-    show_cells(f"runs below {folder}", columns, runs, *([medians] if medians else []))
+    numbers = [_numbers(path) for path in found]
+    groups: dict[str, list[int]] = {}
+    for k, own in enumerate(options):
+        groups.setdefault(_group(names[k], own), []).append(k)
+    several = [members for members in groups.values() if len(members) > 1]
+    results = [_cells(own) for own in numbers]
+    results += [_cells(np.median([numbers[k] for k in some], axis=0).tolist()) for some in several]
+
+    times = [f"sim/ Newton tol={power(tol)}" for tol in TOLS]
+    heads = ("median error", "worst error", "e_mean", "ms sim(force)", *times)
+    room = WIDTH - sum(_width(*column) for column in zip(heads, *results, strict=True))
+    shown = differing_options(names, options, room - MIN_NAME)
+    room -= sum(_width(key, *values) for key, values in shown.items())
+    rows = [
+        [_short(name, room - 2), *values]
+        for name, *values in zip(names, *shown.values(), strict=True)
+    ]
+    for some in several:
+        cells = zip(*(rows[k][1:] for k in some), strict=True)
+        same = [column[0] if len(set(column)) == 1 else "" for column in cells]
+        rows.append([f"median of {len(some)}", *same])
+    lines = [[*row, *result] for row, result in zip(rows, results, strict=True)]
+    sections = [lines[: len(names)], lines[len(names) :]]
+    show_cells(f"runs below {folder}", ("", *shown, *heads), *filter(None, sections))
 
 
-def _numbers(rows: Mapping[str, Any]) -> list[float]:
-    """Return the numbers of a run from the rows of its evaluation by solver; NaN if unknown."""
+def _numbers(path: Path) -> list[float]:
+    """Return the numbers of a run from its evaluation; NaN if unknown."""
+    rows = {row["solver"]: row for row in json.loads(path.read_text())}
+    if PREDICTION not in rows:
+        raise ValueError(f"{path} has no row {PREDICTION}; run evaluate.py run={path.parent}")
     prediction = rows[PREDICTION]
     latency = prediction["latency"].get(SIMULATOR, {}).get("p50", math.nan)
     ratios = []
@@ -66,40 +81,47 @@ def _numbers(rows: Mapping[str, Any]) -> list[float]:
     return [*(prediction["errors"][name] for name in ERRORS), latency, *ratios]
 
 
-def _cells(numbers: list[float]) -> list[str]:
+def _cells(numbers: Sequence[float]) -> list[str]:
     middle, worst, e_mean, *times = numbers
     return [share(middle), share(worst), f"{e_mean:.1e}", *(f"{time:.2g}" for time in times)]
 
 
-def run_names(folders: Sequence[str], options: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return names of runs: their folders, and as many options in which they differ as fit.
+def differing_options(
+    names: Sequence[str], options: Sequence[Mapping[str, Any]], room: int
+) -> dict[str, list[str]]:
+    """Return the values of the options in which runs differ, by the shortest unique ends of keys.
 
-    The folder of a job of a sweep names these options already.
+    The keys in the names of the runs, which are those of a sweep, come first. A key with the values
+    of another key, from which it is interpolated, and keys for which there is no room are left out.
 
     Args:
-        folders: Folders of the runs.
-        options: Hyperparameters of each run.
+        names: Names of the runs.
+        options: Hyperparameters of each run; empty if they are unknown.
+        room: Characters of a line.
     """
-    if all("=" in folder for folder in folders) or len(folders) < 2:
-        return list(folders)
-    shared = set.intersection(*(set(one) for one in options))
-    order = sorted((key for key in options[0] if key in shared), key=lambda key: key.count("."))
-    differ = [key for key in order if len({str(one[key]) for one in options}) > 1]
-    return [
-        _with_options(folder, [f"{key}={one[key]}" for key in differ])
-        for folder, one in zip(folders, options, strict=True)
-    ]
-
-
-def _with_options(folder: str, options: list[str]) -> str:
-    """Return the name of a run with as many options as fit."""
-    name = folder
-    for number, option in enumerate(options):
-        longer = f"{name}{', ' if number else ': '}{option}"
-        if len(longer) > MAX_NAME:
+    known = [one for one in options if one]
+    shared = set.intersection(*(set(one) for one in known)) if known else set()
+    values = {key: [str(one.get(key, "")) for one in options] for key in shared}
+    differ = [key for key in values if len(set(values[key])) > 1]
+    swept = {key: any(f"{key}-" in name for name in names) for key in differ}
+    found: dict[str, list[str]] = {}
+    for key in sorted(differ, key=lambda key: (not swept[key], key.count("."), key)):
+        column = [_short(value, MAX_VALUE) for value in values[key]]
+        if column in found.values():
+            continue
+        name = _unique_end(key, differ)
+        if (room := room - _width(name, *column)) < 0:
             break
-        name = longer
-    return name
+        found[name] = column
+    return found
+
+
+def _unique_end(key: str, keys: Sequence[str]) -> str:
+    """Return the last parts of a key, as many as no other key has."""
+    parts = key.split(".")
+    ends = (".".join(parts[start:]) for start in reversed(range(len(parts))))
+    others = [f".{other}" for other in keys if other != key]
+    return next((end for end in ends if not any(o.endswith(f".{end}") for o in others)), key)
 
 
 def _group(name: str, options: Mapping[str, Any]) -> str:
@@ -108,10 +130,15 @@ def _group(name: str, options: Mapping[str, Any]) -> str:
     It contains the options of a run, or its name if these are unknown.
     """
     kept = {key: value for key, value in options.items() if not key.endswith("seed")}
-    return json.dumps(kept, sort_keys=True, default=str) if kept else SEED.sub("", name)
+    return json.dumps(kept, sort_keys=True, default=str) if kept else name
 
 
-def _short(name: str) -> str:
-    """Return a name without its middle part if it is long."""
-    half = MAX_NAME // 2 - 1
-    return name if len(name) <= MAX_NAME else f"{name[:half]}...{name[-half:]}"
+def _width(head: str, *cells: str) -> int:
+    """Return the characters of a column, with the spaces beside it."""
+    return 2 + max(map(len, (*head.split(), *cells)))
+
+
+def _short(text: str, length: int) -> str:
+    """Return a text without its middle part if it is longer than a length."""
+    half = (length - 3) // 2
+    return text if len(text) <= length else f"{text[:half]}...{text[-half:]}"

@@ -12,7 +12,16 @@ import torch
 from torch import Tensor
 
 from dpl.evaluation.nodal_fields import nodal_fields
-from dpl.evaluation.tables import power, share, show_cells
+from dpl.evaluation.tables import (
+    PREDICTION,
+    TOLS,
+    error_row,
+    newton_row,
+    power,
+    share,
+    show_cells,
+    simulator_row,
+)
 from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
 from dpl.fem import (
     LinearSolver,
@@ -28,12 +37,10 @@ from dpl.fem import (
 from dpl.inference import Corrected, Direct, Hybrid, Simulator
 from dpl.scene import Sample, Scene
 from dpl.system.threads import one_thread
-from dpl.training import RelativeL2, Surrogate
+from dpl.training import RelativeL2, TrainedSurrogate
 from dpl.training.metrics import default_metrics
 from dpl.visualization import plot_deformed
 
-PREDICTION = "prediction"  # name of the row of the bare model
-TOLS = (1e-3, 1e-6)  # relative residuals of simulator and Newton [-]
 ERRORS = (1e-3,)  # estimated relative errors of the simulator [-]
 LEAST_ERROR = 1e-12  # estimated error at which no step is made [-]
 
@@ -66,21 +73,6 @@ class SolverResult:
     ms_p99: float
     estimated_error: float = math.inf
     latency: Mapping[str, Latency] = field(default_factory=dict)
-
-
-def simulator_row(tol: float) -> str:
-    """Return the name of the row of the simulator with a tolerance."""
-    return f"sim(force, tol={power(tol)})"
-
-
-def error_row(error: float) -> str:
-    """Return the name of the row of the simulator with a tolerance for the estimated error."""
-    return f"sim(force, error={power(error)})"
-
-
-def newton_row(tol: float) -> str:
-    """Return the name of the row of Newton's method from rest to a tolerance."""
-    return f"Newton, tol={power(tol)}"
 
 
 def measure(
@@ -125,7 +117,7 @@ def save(rows: Sequence[SolverResult], path: Path) -> None:
 
 
 def evaluate(
-    surrogate: Surrogate,
+    surrogate: TrainedSurrogate,
     test: Sample,
     folder: Path,
     *,
@@ -217,7 +209,7 @@ class _Simulated:
         )
 
 
-def _step_in_modes(surrogate: Surrogate, tol: float) -> dict[str, Solver]:
+def _step_in_modes(surrogate: TrainedSurrogate, tol: float) -> dict[str, Solver]:
     """Return the surrogate with one Newton step in its modes, if it has such a method."""
     newton = surrogate.predictor.correction()
     if newton is None:
@@ -236,7 +228,7 @@ def _own(scene: Scene) -> Newton:
 
 
 def _draw(
-    surrogate: Surrogate, test: Sample, displacements: Mapping[str, Tensor], folder: Path
+    surrogate: TrainedSurrogate, test: Sample, displacements: Mapping[str, Tensor], folder: Path
 ) -> None:
     """Draw the loads with minimum, median and maximum error; write the last one as VTU.
 

@@ -1,4 +1,7 @@
-"""Tables whose rows are instances of a frozen dataclass: print, and write as CSV."""
+"""Tables whose rows are instances of a frozen dataclass: print, and write as CSV.
+
+The names of the rows of an evaluation stand here, so that `compare` need not import torch.
+"""
 
 import csv
 import io
@@ -11,15 +14,34 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape  # a unit such as [m] is no markup
 from rich.table import Table
 
 from dpl.system.files import atomic_write
 
+PREDICTION = "prediction"  # name of the row of the bare model
+SIMULATOR, NETWORK = "sim(force)", "bare network"  # names of the two latencies
+TOLS = (1e-3, 1e-6)  # relative residuals of simulator and Newton [-]
+
 
 def show(rows: Sequence[Any], title: str) -> None:
-    """Print rows of a dataclass, one column for each field."""
-    columns = [field.name.replace("_", " ") for field in fields(rows[0])]
-    show_cells(title, columns, [[text(value, 3) for value in astuple(row)] for row in rows])
+    """Print rows of a dataclass, one column for each field.
+
+    A field may have a unit in its metadata. Numbers whose unit is "%" are stored relative to 1.
+    """
+    units = [field.metadata.get("unit", "") for field in fields(rows[0])]
+    columns = [
+        field.name.replace("_", " ") + (f" [{unit}]" if unit not in ("", "%") else "")
+        for field, unit in zip(fields(rows[0]), units, strict=True)
+    ]
+    cells = [
+        [
+            share(value) if unit == "%" and not math.isnan(value) else text(value, 3)
+            for value, unit in zip(astuple(row), units, strict=True)
+        ]
+        for row in rows
+    ]
+    show_cells(title, columns, cells)
 
 
 def show_cells(title: str, columns: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:
@@ -28,17 +50,32 @@ def show_cells(title: str, columns: Sequence[str], *sections: Sequence[Sequence[
     Words of a title stand below each other, so that columns are as narrow as their numbers.
     """
     table = Table(
-        title=title or None, title_justify="left", title_style="", box=box.SIMPLE_HEAD,
+        title=escape(title) or None, title_justify="left", title_style="", box=box.SIMPLE_HEAD,
         pad_edge=False, padding=(0, 1, 0, 0),
     )  # fmt: skip
     for number, column in enumerate(columns):
         words = column.replace(" ", "\n") if number else column
-        table.add_column(words, justify="right" if number else "left", no_wrap=True)
+        table.add_column(escape(words), justify="right" if number else "left", no_wrap=True)
     for rows in sections:
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*map(escape, row))
         table.add_section()
     Console(width=max(Console().width, 200)).print(table)
+
+
+def simulator_row(tol: float) -> str:
+    """Return the name of the row of the simulator with a tolerance."""
+    return f"sim(force, tol={power(tol)})"
+
+
+def error_row(error: float) -> str:
+    """Return the name of the row of the simulator with a tolerance for the estimated error."""
+    return f"sim(force, error={power(error)})"
+
+
+def newton_row(tol: float) -> str:
+    """Return the name of the row of Newton's method from rest to a tolerance."""
+    return f"Newton, tol={power(tol)}"
 
 
 def share(number: float) -> str:

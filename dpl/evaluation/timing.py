@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from dpl.evaluation.tables import NETWORK, SIMULATOR
 from dpl.fem import Load, Solution, Solver, solve
 from dpl.fem.solvers import concatenate
 from dpl.inference import Simulator
@@ -16,7 +17,6 @@ from dpl.system.threads import one_thread
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 WARM_UP = 5  # loads solved before the clock starts
-SIMULATOR, NETWORK = "sim(force)", "bare network"  # names of the two latencies
 
 
 @dataclass(frozen=True)

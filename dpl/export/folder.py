@@ -22,13 +22,16 @@ from dpl.export.metadata import FORMAT
 from dpl.export.onnx_graph import Array
 from dpl.fem import HasModes
 from dpl.system.files import atomic_write
-from dpl.training import Surrogate, checkpoints
+from dpl.training import TrainedSurrogate, checkpoints
 
 RAW = np.dtype("<f8")
 
 
 def write_folder(
-    folder: Path, surrogate: Surrogate, reference: Mapping[str, Array], meta: Mapping[str, Any]
+    folder: Path,
+    surrogate: TrainedSurrogate,
+    reference: Mapping[str, Array],
+    meta: Mapping[str, Any],
 ) -> None:
     """Write all files except the graph and the report.
 
@@ -88,7 +91,10 @@ def read_reference(folder: Path) -> dict[str, Array]:
 
 
 def verify_folder(
-    folder: Path, surrogate: Surrogate, reference: Mapping[str, Array], meta: Mapping[str, Any]
+    folder: Path,
+    surrogate: TrainedSurrogate,
+    reference: Mapping[str, Array],
+    meta: Mapping[str, Any],
 ) -> None:
     """Read all files back and compare them bit for bit with the data.
 

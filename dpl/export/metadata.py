@@ -13,7 +13,7 @@ from dpl.fem import HasModes, Problem, evaluate_solution, solve, surface
 from dpl.fem.mesh.writing import flat_cells
 from dpl.fem.postprocess import triangles
 from dpl.scene import Scene
-from dpl.training import Surrogate
+from dpl.training import TrainedSurrogate
 from dpl.version import __version__
 
 FORMAT = 4  # version of the keys of meta.json
@@ -92,7 +92,7 @@ def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
     return {"file": path.name, "opset": onnx_opset(path), **named}
 
 
-def _scales(module: Surrogate) -> dict[str, Any]:
+def _scales(module: TrainedSurrogate) -> dict[str, Any]:
     return {
         "length": module.scene.length,
         "force_unit": module.scene.force_unit,

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from dpl.training import Surrogate
+from dpl.training import TrainedSurrogate
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 Array = NDArray[np.float64]
@@ -29,7 +29,7 @@ def missing_packages() -> list[str]:
 
 
 class ExportGraph(nn.Module):
-    """Surrogate as a graph of tensor operations.
+    """TrainedSurrogate as a graph of tensor operations.
 
     Attributes:
         surrogate: The trained surrogate.
@@ -38,7 +38,7 @@ class ExportGraph(nn.Module):
 
     outputs = ("displacement",)
 
-    def __init__(self, surrogate: Surrogate) -> None:
+    def __init__(self, surrogate: TrainedSurrogate) -> None:
         """Take a trained surrogate on the CPU."""
         super().__init__()
         self.surrogate = surrogate.eval()
@@ -50,7 +50,7 @@ class ExportGraph(nn.Module):
         return ["force", "young", "parameters"] if ranges else ["force", "young"]
 
     def forward(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """Return displacements (B, N, D) [m], see `Surrogate.forward`."""
+        """Return displacements (B, N, D) [m], see `TrainedSurrogate.forward`."""
         found: Tensor = self.surrogate(force, young, parameters)
         return found
 

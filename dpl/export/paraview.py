@@ -1,13 +1,13 @@
 """Files for ParaView: forces, displacements, stresses and det F at the nodes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 
 from dpl.evaluation.nodal_fields import nodal_fields
 from dpl.fem import Load, solve, write_series
-from dpl.training import Surrogate
+from dpl.training import TrainedSurrogate
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,15 @@ class ResultRow:
     """
 
     load: int
-    young: float
-    max_displacement: float
-    max_von_mises: float
+    young: float = field(metadata={"unit": "Pa"})
+    max_displacement: float = field(metadata={"unit": "m"})
+    max_von_mises: float = field(metadata={"unit": "Pa"})
     min_det_F: float
-    error: float
+    error: float = field(metadata={"unit": "%"})
 
 
 def write_results(
-    surrogate: Surrogate, load: Load, path: Path, *, solve_reference: bool = True
+    surrogate: TrainedSurrogate, load: Load, path: Path, *, solve_reference: bool = True
 ) -> tuple[list[ResultRow], list[Path]]:
     """Write predictions as a series of VTU files, a PVD collection and an XDMF file.
 

@@ -29,7 +29,7 @@ from dpl.inference.request import Candidate, Request
 from dpl.inference.training_range import RangeCheck
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
-from dpl.training import Surrogate
+from dpl.training import TrainedSurrogate
 
 CORRECTED = 3e-4  # change of a displacement below which its correction ends, over its norm [-]
 MAX_PATCHES = 2  # patches whose compliance and held body are kept
@@ -207,7 +207,7 @@ class Gripper:
         steps: Largest number of corrections of a prediction.
     """
 
-    def __init__(self, surrogate: Surrogate, *, steps: int) -> None:
+    def __init__(self, surrogate: TrainedSurrogate, *, steps: int) -> None:
         """Store the surrogate; a patch is prepared when it is grasped for the first time."""
         self.surrogate, self.steps = surrogate, steps
         self._patches: OrderedDict[bytes, RigidPatch] = OrderedDict()

@@ -31,7 +31,7 @@ from dpl.inference.training_range import RangeCheck
 from dpl.models.unrolled.correction import MAX_STEPS
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
-from dpl.training import Surrogate
+from dpl.training import TrainedSurrogate
 
 SUFFICIENT = 2e-3  # steps leave an error of 1e-3 in the modes, and about as much outside [-]
 ERROR = 1e-3  # estimated relative error above which they are made [-]
@@ -60,7 +60,11 @@ class Simulator:
     """
 
     def __init__(
-        self, surrogate: Surrogate, *, newton: SubspaceNewton | None = None, steps: int = MAX_STEPS
+        self,
+        surrogate: TrainedSurrogate,
+        *,
+        newton: SubspaceNewton | None = None,
+        steps: int = MAX_STEPS,
     ) -> None:
         """Store the surrogate and build the corrector of its scene.
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from dpl.fem import Load
 from dpl.fem.loads.family import MAX_DISTANCE
 from dpl.inference.answer import ROUNDOFF
-from dpl.training import Surrogate
+from dpl.training import TrainedSurrogate
 
 
 class RangeCheck(NamedTuple):
@@ -27,7 +27,7 @@ class RangeCheck(NamedTuple):
     outside: Tensor
 
     @classmethod
-    def of(cls, surrogate: Surrogate, load: Load) -> Self:
+    def of(cls, surrogate: TrainedSurrogate, load: Load) -> Self:
         """Return the position of loads relative to the range of a surrogate's scene."""
         amplitude, out_of_span = surrogate.scene.loads.project(load.force)
         outside = (amplitude > 1 + ROUNDOFF) | (out_of_span > MAX_DISTANCE)
@@ -53,7 +53,9 @@ class RangeCheck(NamedTuple):
         return [type(self)(*column) for column in columns]
 
 
-def _inputs(surrogate: Surrogate, load: Load) -> Sequence[tuple[Tensor, tuple[float, float]]]:
+def _inputs(
+    surrogate: TrainedSurrogate, load: Load
+) -> Sequence[tuple[Tensor, tuple[float, float]]]:
     """Return the moduli (B,) that are inputs of the network, each with its range."""
     loads = surrogate.scene.loads
     pairs = list(zip(load.parameters.unbind(1), loads.parameter_ranges.values(), strict=True))

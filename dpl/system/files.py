@@ -16,6 +16,8 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+# checkpoints from which a run is loaded, by priority; a short run has only its last one
+LOADABLE = ("best.safetensors", "best.ckpt", "last.ckpt")
 MAX_ARRAY_SIZE = 2**30  # of an array in a file, and of its float64 numbers [bytes]
 MAX_TEXT_SIZE = 2.0**28  # of a text file in a data set [bytes]
 

@@ -5,8 +5,6 @@ import os
 from collections.abc import Iterator
 from contextvars import ContextVar
 
-import torch
-
 NODE_SIZE = 1000  # lower bound of the memory of a node with its row of K(0), in 2D [bytes]
 _MOST: ContextVar[tuple[int, str] | None] = ContextVar("most nodes of a mesh", default=None)
 
@@ -21,6 +19,8 @@ def refuse_beyond(needed: float, limit: float | None, what: str, remedy: str) ->
         remedy: Advice for the user.
     """
     if limit is None:
+        import torch  # not needed by those who read meshes
+
         limit = torch.cuda.mem_get_info()[1] / 1e9 if torch.cuda.is_available() else machine()
     if needed > limit:
         raise MemoryError(f"{what} need {needed:,.1f} GB, there are {limit:.1f} GB; {remedy}")

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.data.datamodule import Samples
+from dpl.data.samples import Samples
 from dpl.fem import Load
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.models.linear_base import LinearBase

@@ -4,7 +4,7 @@ A predictor is the only border between float64 mechanics and a float32 network.
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +19,9 @@ from dpl.models.protocols import HasBases, HasCorrection
 from dpl.models.stored_buffers import StoredBuffers
 from dpl.scene import Sample, Scene
 from dpl.training.linear_samples import LinearBatch, LinearSamples, linear_solutions
-from dpl.training.losses.loss import Loss, LossContext
+
+if TYPE_CHECKING:  # the losses import Lightning, which a loaded run does not need
+    from dpl.training.losses.loss import Loss, LossContext
 
 MAX_SNAPSHOTS = 4096  # samples and images from which a network computes its bases
 SCALES = ("force_scale", "displacement_scale")
@@ -115,7 +117,7 @@ class Predictor(StoredBuffers):
         """Type of the weights."""
         return next((weights.dtype for weights in self.net.parameters()), torch.float32)
 
-    def loss(self, batch: Any, loss: Loss, physics: LossContext) -> Tensor:
+    def loss(self, batch: Any, loss: "Loss", physics: "LossContext") -> Tensor:
         """Return the loss of a batch of `dataset`, ()."""
         return loss(*self.predict_batch(batch), physics)
 
@@ -124,14 +126,14 @@ class Predictor(StoredBuffers):
         own = hasattr(self.net, "correction")
         return cast(HasCorrection, self.net).correction() if own else None
 
-    def describe(self, loss: Loss) -> str:
+    def describe(self, loss: "Loss") -> str:
         """Return name and size of the network, and the loss."""
         count = sum(weights.numel() for weights in self.net.parameters())
         return f"{type(self.net).__name__}, {count:,} weights; loss {type(loss).__name__}"
 
-    def skipped_work(self) -> list[str]:
-        """Return the work that the network saves, one line each."""
-        return list(getattr(self.net, "skipped_work", list)())
+    def skipped_work(self, loss: "Loss") -> list[str]:
+        """Return the work that network and loss save, one line each."""
+        return [*getattr(self.net, "skipped_work", list)(), *loss.skipped_work()]
 
     def check_buffers(self) -> None:
         """Raise ValueError if a scale is not positive."""
@@ -252,10 +254,10 @@ class OnLinearSolution(Predictor):
         missed = torch.where(self.problem.free, samples.displacement - linear, 0.0)
         return self.base.whiten(field), self.base.scale_outputs(missed, amplitude, scale)
 
-    def skipped_work(self) -> list[str]:
-        """Return the work that the network and the base save, one line each."""
+    def skipped_work(self, loss: "Loss") -> list[str]:
+        """Return the work that network, base and loss save, one line each."""
         line = "no learning of linear elasticity: the network adds to K(0)^-1 f"
-        return [*super().skipped_work(), line]
+        return [*super().skipped_work(loss), line]
 
 
 class Fitted(Predictor):
@@ -268,9 +270,13 @@ class Fitted(Predictor):
         """Return displacements over L, (B, N, D) [-], float64."""
         return cast(Tensor, self.net(load.force, self.parameters_of(load)))
 
-    def describe(self, loss: Loss) -> str:
+    def describe(self, loss: "Loss") -> str:
         """Return the name of the model."""
         return f"{type(self.net).__name__}, fitted by linear regression"
+
+    def skipped_work(self, loss: "Loss") -> list[str]:
+        """Return the work that the model saves, one line each; the loss is not used."""
+        return list(getattr(self.net, "skipped_work", list)())
 
 
 def predictor_of(

@@ -1,38 +1,36 @@
-"""The LightningModule: a predictor with loss, metrics and optimiser."""
+"""The LightningModule: a surrogate with loss, metrics and optimiser."""
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Self, cast
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Self
 
 import lightning as L
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from dpl.fem import Load
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.models.inputs import Base, Inputs
-from dpl.models.linear_base import SCALE_STREAM
 from dpl.scene import Sample, Scene
 from dpl.training import checkpoints
 from dpl.training.callbacks.averaged_weights import AveragedWeights
 from dpl.training.losses.loss import Loss, LossContext
 from dpl.training.metrics import default_metrics
-from dpl.training.predictors import predictor_of
 from dpl.training.random_states import random_states, set_random_states
 from dpl.training.schedules import step_in_time, time_fraction, total_steps
+from dpl.training.trained import TrainedSurrogate
 
 
-class Surrogate(L.LightningModule):
-    """A network that predicts the displacement in equilibrium with a load.
-
-    `forward` takes newtons and pascals and returns metres; `predict` is dimensionless.
+class Surrogate(TrainedSurrogate, L.LightningModule):
+    """A network that predicts the displacement in equilibrium with a load, with its training.
 
     Attributes:
-        predictor: The network with its scales, perhaps on the linear solution, see `Predictor`.
-        scene: The scene.
         loss: The loss.
         physics: The part of the scene that losses need, on the device of the network.
     """
+
+    if TYPE_CHECKING:  # type checkers do not follow Lightning
+
+        def __getattr__(self, name: str) -> Any: ...
 
     def __init__(
         self,
@@ -65,14 +63,10 @@ class Surrogate(L.LightningModule):
         Raises:
             ValueError: There is no such base, or it excludes the network or another option.
         """
-        super().__init__()
-        self.predictor = predictor_of(net, scene, base, young=young)
-        self.loss, self.scene = loss, scene
+        super().__init__(net, scene, base=base, young=young)
+        self.loss = loss
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
-        self.largest_force: Tensor
-        largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
-        self.register_buffer("largest_force", largest_force)
         self.physics = LossContext(scene.problem, self.largest_force)
         self.val_metrics = default_metrics(scene.problem).clone(prefix="val/")
         self.test_metrics = default_metrics(scene.problem).clone(prefix="test/")
@@ -92,32 +86,13 @@ class Surrogate(L.LightningModule):
         net = network(scene, Inputs.from_scene(scene, base, young=young))
         return cls(net, loss, scene, base=base, young=young, **options)
 
-    @property
-    def net(self) -> nn.Module:
-        """The network."""
-        return self.predictor.net
-
-    def forward(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """Return displacements (B, N, D) [m] under nodal forces (B, N, D) [N].
-
-        Args:
-            force: Nodal forces, (B, N, D) [N].
-            young: Young's moduli, (B,) [Pa].
-            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
-        """
-        return self.scene.length * self.predict(self.scene.load_of(force, young, parameters))
-
-    def predict(self, load: Load) -> Tensor:
-        """Return displacements over L, (B, N, D) [-], float64."""
-        return cast(Tensor, self.predictor(load))
-
     def describe(self) -> list[tuple[str, str]]:
         """Return name and size of the network, and the loss."""
         return [("model", self.predictor.describe(self.loss))]
 
     def skipped_work(self) -> list[str]:
         """Return the work that network and loss save, one line each."""
-        return [*self.predictor.skipped_work(), *self.loss.skipped_work()]
+        return self.predictor.skipped_work(self.loss)
 
     def encode(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
         """Return the training set of samples and their images, see `Predictor.dataset`."""
@@ -222,34 +197,6 @@ class Surrogate(L.LightningModule):
         """
         checkpoints.check_scene(checkpoint, self.scene)
         self._random_states = checkpoint.get("random")
-
-    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
-        """Load weights; the arguments are those of `torch.nn.Module`.
-
-        Raises:
-            ValueError: A tensor has another type, is not finite, or is none that a fit can give.
-            RuntimeError: The weights are of another network.
-        """
-        own = self.state_dict()
-        if "force_scale" in state_dict:
-            raise ValueError("was written by an earlier version of dpl; train the run again")
-        for name, stored in state_dict.items():
-            dtype = own[name].dtype if name in own else stored.dtype
-            if stored.dtype != dtype and not stored.is_floating_point() & dtype.is_floating_point:
-                raise ValueError(f"{name} of {stored.dtype} must be of {dtype}")
-            if not stored.to(dtype).isfinite().all():
-                raise ValueError(f"{name} must be finite")
-        found = super().load_state_dict(state_dict, *args, **options)
-        if not self.largest_force > 0:
-            raise ValueError(f"largest_force = {float(self.largest_force)} must be above 0")
-        return found
-
-    def check_predictions(self) -> None:
-        """Raise ValueError if a prediction of a load of the scene is not finite."""
-        load = self.scene.loads.sample((0, SCALE_STREAM), range(2))
-        with torch.no_grad():  # tensors that a network keeps are used for derivatives, too
-            if not self.predict(load).isfinite().all():
-                raise ValueError("the answers of the network are not finite")
 
     def on_train_start(self) -> None:
         """Restore the states of random number generators of a resumed run."""

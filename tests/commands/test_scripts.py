@@ -1,5 +1,6 @@
 """The commands, end to end: what a user types, and what is there afterwards."""
 
+import itertools
 import json
 import os
 import signal
@@ -54,7 +55,7 @@ def trained(start, tiny_training, home):
 def test_training_ends_with_a_table_and_the_next_commands(trained, home):
     status, out, err = trained
     assert status == 0, err[-2000:]
-    assert out.index("skipped, because") < out.index("24 accepted, 0 rejected")
+    assert out.index("skipped   ") < out.index("24 accepted, 0 rejected")
     assert out.index("24 accepted, 0 rejected") < out.index("4 test loads")
     rows = json.loads((home / "runs/first/evaluation.json").read_text())
     assert [row["solver"] for row in rows] == ROWS
@@ -184,10 +185,18 @@ def test_a_mesh_from_a_file_of_another_program_is_trained_on(script, tmp_path):
     flipped = np.linalg.det(edges) < 0
     cells[flipped] = cells[flipped][:, [0, 2, 1, 3]]
     meshio.write(tmp_path / "part.msh", meshio.Mesh(points[shuffled], [("tetra", cells)]), "gmsh22")
-    sizes = ["data.train=6", "data.val=2", "data.test=2", "data.workers=0", "model=fcnn", "model.width=8"]
+    sizes = [
+        "data.train=6",
+        "data.val=2",
+        "data.test=2",
+        "data.workers=0",
+        "model=fcnn",
+        "model.width=8",
+    ]
     ended = script(
         "train", "mesh=file", "mesh.path=part.msh", "loads.n_modes=2", "solver.linear=superlu",
         *sizes, "trainer.max_epochs=1", "trainer.check_val_every_n_epoch=1", "run=part",
+        "extras.verbose=true",
         cwd=tmp_path,
     )  # fmt: skip
     assert ended.status == 0, ended.err[-2000:]
@@ -361,6 +370,9 @@ def test_a_sweep_over_networks_gives_each_the_loss_that_is_asked_for_and_a_folde
         ("PODNet", "MSE", "AdamW"),
         ("PODNet", "LrStar", "AdamW"),
     }
+    pairs = itertools.product(("mse", "lr_star"), ("fcnn", "pod"))
+    names = {f"loss-{loss}_model-{model}" for loss, model in pairs}
+    assert {folder.name for folder in runs.values()} == names, "the keys that are swept, no others"
     judged = {json.loads((folder / "evaluation.json").read_text())[1]["errors"]["e_mean"]
               for folder in runs.values()}  # fmt: skip
     assert len(judged) == 4, "each run is another one"

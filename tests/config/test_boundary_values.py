@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dpl import ConfigError
-from dpl.config import build
+from dpl.config import build, plain
 from dpl.data import DataModule
 from dpl.fem import DirichletBC, Plane, Problem, RobinBC, Traction, box
 from dpl.fem.units import Units
@@ -137,7 +137,7 @@ def test_a_boundary_value_that_cannot_be_used_is_refused_by_its_key(
     cfg = compose(*BAR, *overrides)
 
     def start():
-        build.check(cfg)
+        plain.check(cfg)
         build.build_scene(cfg)
 
     with pytest.raises(ConfigError, match=BAD[overrides]) as refusal:

@@ -14,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from laws import LAWS
 from omegaconf import OmegaConf
 
-from dpl.config import ConfigError, build
+from dpl.config import ConfigError, build, plain
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.fem import ParameterRange, YoungPoissonMaterial, box, solve
 
@@ -133,7 +133,7 @@ def test_laws_share_young_and_poisson_at_rest(material):
 @pytest.mark.parametrize("name", options("experiment"))
 def test_an_experiment_composes_and_passes_the_check(compose, name):
     cfg = compose(f"experiment={name}", "folder=.", command="train")
-    build.check(cfg)
+    plain.check(cfg)
     assert_holds(cfg, "experiment", name)
 
 
@@ -148,7 +148,7 @@ def test_a_sweep_composes_passes_the_check_and_searches_among_what_there_is(
         *([f"experiment={experiment}"] if experiment else []),
         "folder=.",
     ]
-    build.check(compose(*choices, command="train"))
+    plain.check(compose(*choices, command="train"))
     search = OmegaConf.load(CONF / "hparams_search" / f"{name}.yaml").hydra.sweeper.params
     spaces = OverridesParser.create().parse_overrides(
         [f"{k}={space}" for k, space in search.items()]
@@ -161,7 +161,7 @@ def test_a_sweep_composes_passes_the_check_and_searches_among_what_there_is(
             values[one.key_or_group] = among[end]
         cfg = compose(*choices, *(f"{k}={v}" for k, v in values.items()), command="train")
         assert {key: OmegaConf.select(cfg, key) for key in values} == values
-        build.check(cfg)
+        plain.check(cfg)
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +182,7 @@ def test_an_option_changes_only_its_group_and_passes_the_check(
 ):
     """Recipes that change several groups are experiments."""
     cfg = compose(*overrides(group, name), "folder=.", "run=x", command="train")
-    build.check(cfg)
+    plain.check(cfg)
     assert_holds(cfg, group, name)
     assert {key for key in cfg if cfg[key] != usual[key]} <= {group}
 
@@ -224,7 +224,7 @@ def test_the_default_is_the_main_job(compose):
 @pytest.mark.parametrize("name", options("debug"))
 def test_a_debug_option_composes_and_passes_the_check(compose, name):
     cfg = compose(f"debug={name}", "folder=.", command="train")
-    build.check(cfg)
+    plain.check(cfg)
     assert cfg.tags == ["debug"]
     assert cfg.trainer.accelerator == "cpu"
     assert list(cfg.callbacks) == ["best_weights", "last_checkpoint"]
@@ -241,7 +241,7 @@ def test_callbacks_and_loggers_are_changed_added_and_removed_by_name(compose):
         "trainer.accelerator=cpu",
     ]
     cfg = compose("folder=.", *changes, command="train")
-    build.check(cfg)
+    plain.check(cfg)
     trainer = build.build_trainer(cfg)
     names = [type(callback).__name__ for callback in trainer.callbacks]
     assert "EarlyStopping" in names
@@ -267,7 +267,7 @@ def test_the_command_line_wins_over_an_experiment(compose):
     numbers = ["optimizer.lr=1e-2", "data.batch_size=8", "model=pod", "model.base=linear"]
     cfg = compose(*numbers, "experiment=paper", "folder=.", command="train")
     assert (cfg.optimizer.lr, cfg.data.batch_size, cfg.model.base) == (1e-2, 8, "linear")
-    build.check(cfg)
+    plain.check(cfg)
 
 
 @pytest.mark.parametrize("name", options("model"))
@@ -285,7 +285,7 @@ def test_every_model_has_the_linear_solution_unless_the_paper_is_asked_for(compo
 def test_experiments_are_combined(compose):
     experiment = compose("experiment=beam_nh_loss", "folder=.", command="train")
     cfg = compose("experiment=[beam_nh_loss,paper]", "folder=.", command="train")
-    build.check(cfg)
+    plain.check(cfg)
     assert cfg.mesh == experiment.mesh
     assert cfg.data.train == experiment.data.train == 4095
     assert cfg.loss._target_.endswith("LrStar")

@@ -10,7 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import dpl
-from dpl.config import ConfigError, build, resume, run_folder, validation
+from dpl.config import ConfigError, plain, resume, run_folder, validation
 
 STORED = {  # options of train.py
     "default": [],
@@ -43,7 +43,7 @@ CALLS = [  # each calls or imports a module outside the package
 @pytest.fixture
 def stored(compose):
     """Composes the configuration that train.py stores."""
-    return lambda *options: build.to_container(
+    return lambda *options: plain.to_container(
         compose("folder=runs/a", "run=runs/a", *options, command="train")
     )
 
@@ -132,7 +132,7 @@ READERS = {  # arguments of the commands that read a run
     ("command", "key"),
     zip(
         ["load", *READERS],
-        itertools.cycle(["trainer.profiler", "callbacks.more", "loads.amplitude"]),
+        itertools.cycle(["loads.amplitude", "trainer.profiler", "callbacks.more"]),
         strict=False,
     ),
 )
@@ -170,7 +170,7 @@ def test_the_command_line_may_name_any_object_where_one_is_expected(key, compose
         return resume.resumed_config(compose(*lines, command="train"), lines)
 
     again = resumed(f"{key}={OWN[key]}")
-    build.check(again)
+    plain.check(again)
     assert OmegaConf.select(again, place) == own
     assert resumed("trust=true").trainer == again.trainer
     with pytest.raises(ConfigError, match="not called without trust=true"):
@@ -195,4 +195,4 @@ def test_a_call_is_refused_where_a_value_is_expected(stored, key):
     cfg = OmegaConf.create(stored())
     OmegaConf.update(cfg, key, {"_target_": "builtins.str"}, merge=False)
     with pytest.raises(ConfigError, match=f"^{key.partition('.')[0]}.* = .* must be"):
-        build.check(cfg)
+        plain.check(cfg)

@@ -29,7 +29,7 @@ from benchmarks.commands import (
     verify,
 )
 from dpl.commands import cli
-from dpl.config import ConfigError, build, resume, run_folder, validation
+from dpl.config import ConfigError, build, plain, resume, run_folder, validation
 from dpl.training import checkpoints
 
 ROOT = Path(__file__).parents[2]
@@ -116,7 +116,7 @@ def test_what_cannot_work_is_refused_by_its_key(compose, override, tmp_path):
     cfg = compose("mesh.nodes=[5,3,3]", *words) if "mesh" not in override else compose(*words)
 
     def start():
-        build.check(cfg)
+        plain.check(cfg)
         build.show_plan(build.build_scene(cfg))
 
     with pytest.raises(ConfigError, match=BAD[override]) as refusal:
@@ -204,7 +204,7 @@ KEYS = {
 def test_what_a_command_is_told_is_held_to_what_it_must_be(compose, line):
     command, *overrides = line.split()
     with pytest.raises(ConfigError, match=BAD_COMMANDS[line]):
-        build.check(compose(*overrides, command=command), keys=KEYS.get(command, ()))
+        plain.check(compose(*overrides, command=command), keys=KEYS.get(command, ()))
 
 
 @pytest.mark.parametrize("override", BAD_TRAINING)
@@ -213,7 +213,7 @@ def test_what_cannot_train_is_refused_by_its_key(compose, override, scene, tmp_p
     cfg = compose("folder=.", *words, command="train")
 
     def start():
-        build.check(cfg)
+        plain.check(cfg)
         build.instantiate(cfg, "data", scene=scene)
         build.build_surrogate(cfg, scene)
         build.build_trainer(cfg)
@@ -230,13 +230,13 @@ def test_what_cannot_train_is_refused_by_its_key(compose, override, scene, tmp_p
 def test_what_works_is_not_refused(compose, override):
     cfg = compose("folder=.", override, command="train")
     before = OmegaConf.to_yaml(cfg)
-    build.check(cfg)
+    plain.check(cfg)
     assert OmegaConf.to_yaml(cfg) == before, "a check changes nothing"
 
 
 def test_a_body_whose_stiffness_is_no_matrix_is_refused(compose, tiny):
     cfg = compose(*tiny, "material=yeoh_k2", "material.bulk=1e300", "+mesh.cell=tetra")
-    build.check(cfg)
+    plain.check(cfg)
     with pytest.raises(ConfigError, match=r"material, mesh, .*K\(0\) cannot be used"):
         build.build_scene(cfg)
 
@@ -255,7 +255,7 @@ def test_a_body_that_is_held_everywhere_is_refused(compose, tiny):
 def test_what_a_key_gives_must_be_of_its_kind(compose, tiny, made):
     cfg = compose(*tiny)
     cfg.material = {"_target_": made}
-    build.check(cfg)
+    plain.check(cfg)
     with pytest.raises(ConfigError, match=r"material gives an object of .*; it must give Material"):
         build.build_scene(cfg)
     cfg = compose(*tiny)
@@ -272,7 +272,7 @@ def test_what_must_be_a_call_is_refused_where_it_is_none(compose, tiny, value):
         cfg = compose(*tiny)
         cfg[key] = value
         with pytest.raises(ConfigError, match=f"{key} = .* must be a call"):
-            build.check(cfg)
+            plain.check(cfg)
 
 
 def test_no_configuration_may_leave_the_body_loose(compose, tiny):
@@ -291,7 +291,7 @@ def test_checking_calls_nothing(compose, monkeypatch):
     monkeypatch.setattr("dpl.fem.mesh.reading.read_mesh", lambda path: called.append(path))
     cfg = compose("mesh=file", "mesh.path=part.msh")
     cfg.mesh._target_ = "dpl.fem.read_mesh"
-    build.check(cfg)
+    plain.check(cfg)
     assert called == []
 
 
@@ -347,6 +347,38 @@ def test_generation_imports_neither_lightning_nor_matplotlib(tmp_path, environme
     assert "train: 3 of 3 loads accepted" in ended.stdout
 
 
+EARLY = textwrap.dedent(
+    """
+    import runpy, sys
+    for line in ("evaluate run=no", "view run=no", "export run=no", "compare run=no",
+                 "train model.widht=3"):
+        name, *sys.argv[1:] = line.split()
+        try:
+            runpy.run_path(f"{sys.argv[0]}/{name}.py", run_name="__main__")
+        except SystemExit as end:
+            print(end.code, "torch" in sys.modules)
+    from dpl.config import load_run
+    from dpl.inference import Simulator
+    print("torch" in sys.modules, "lightning" in sys.modules)
+    """
+)
+
+
+def test_errors_are_found_without_torch_and_runs_are_loaded_without_lightning(
+    tmp_path, environment
+):
+    ended = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.argv = [{str(ROOT / 'scripts')!r}]\n{EARLY}"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ended.stdout.splitlines() == ["2 False"] * 5 + ["True False"]
+    assert [line.partition(":")[0] for line in ended.stderr.splitlines()] == ["error"] * 5
+
+
 @pytest.mark.skipif(
     importlib.util.find_spec("optuna") is not None,
     reason="Optuna is installed",
@@ -363,13 +395,14 @@ def test_a_sweep_without_optuna_says_in_one_line_what_to_install(script, argumen
 
 def test_hyperparameters_are_flat_and_a_call_goes_by_its_name(compose):
     cfg = compose("folder=.", "model=pod", "young=[1e6,2e11]", command="train")
-    flat = build.hyperparameters(cfg)
+    flat = plain.hyperparameters(cfg)
     assert flat["model"] == "PODNet"
     assert (flat["model.width"], flat["optimizer.lr"], flat["loss"]) == (256, 5e-3, "RMSELoss")
     assert flat["young"] == "[1000000.0, 200000000000.0]"
     assert all(isinstance(value, bool | int | float | str) for value in flat.values())
     noise = ("run", "folder", "ckpt_path", "callbacks", "logger", "paths", "extras", "tags")
     assert not [key for key in flat if key.startswith(noise) or "_target_" in key]
+    assert flat.keys() - plain.hyperparameters(cfg, without=("loss",)).keys() >= {"loss"}
 
 
 @pytest.mark.parametrize(
@@ -705,7 +738,7 @@ def test_a_run_is_resumed_with_the_configuration_that_lies_in_it(trained, resume
         assert cfg[key] == before[key], key
     assert (cfg.trainer.max_epochs, cfg.trainer.check_val_every_n_epoch) == (7, 1)
     assert "early_stopping" in cfg.callbacks, "those of the command line"
-    build.check(cfg)
+    plain.check(cfg)
     assert resume.check_resumed(cfg)["epoch"] == 0
 
 
@@ -726,7 +759,7 @@ def test_an_option_of_the_trainer_changes_only_the_machine_of_a_resumed_run(
     assert (cfg.trainer.max_epochs, cfg.trainer.check_val_every_n_epoch) == (1, 1)
     longer = resumed_config(trained[0], "trainer.max_epochs=7", "trainer=cpu")
     assert (longer.trainer.accelerator, longer.trainer.max_epochs) == ("cpu", 7)
-    build.check(longer)
+    plain.check(longer)
     assert resume.check_resumed(longer)["epoch"] == 0
 
 

@@ -12,7 +12,7 @@ import torch
 
 from dpl import Sample
 from dpl.evaluation import compare, evaluate, timing
-from dpl.evaluation.comparison import run_names
+from dpl.evaluation.comparison import differing_options
 from dpl.evaluation.report import SolverResult, measure, save, show
 from dpl.fem import Load, Solution, evaluate_solution
 from dpl.fem import fields as nodal_stress
@@ -106,25 +106,23 @@ def test_saved_rows_can_be_read(scene, few, tmp_path):
     assert [SolverResult(**row) for row in json.loads((tmp_path / "rows.json").read_text())] == rows
 
 
-def test_runs_that_differ_in_the_seed_form_a_group(evaluated, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100")
+def test_runs_that_differ_in_the_seed_form_a_group(evaluated, tmp_path, capsys):
     rows, _ = evaluated
-    for k, name in enumerate(("loss=mse,seed=0", "loss=mse,seed=1", "loss=lr_star,seed=0")):
-        (tmp_path / name).mkdir()
+    for k, (loss, seed) in enumerate((("MSE", 0), ("MSE", 1), ("LrStar", 0))):
+        folder = tmp_path / f"loss-{loss}_seed-{seed}"
+        folder.mkdir()
+        (folder / "config.yaml").write_text(json.dumps({"loss": loss, "seed": seed}))
         prediction = replace(rows[1], errors={**rows[1].errors, "e_mean": 0.125 * (k + 1)})
-        save([rows[0], prediction, *rows[2:]], tmp_path / name / "evaluation.json")
+        save([rows[0], prediction, *rows[2:]], folder / "evaluation.json")
     compare(tmp_path)
     lines = capsys.readouterr().out.splitlines()
-    (one,) = [line for line in lines if "median of 2: loss=mse" in line]
+    (one,) = [line for line in lines if "median of" in line]
+    assert one.split()[:4] == ["median", "of", "2", "MSE"], "no seed"
     assert " 1.9e-01 " in one, "the mean of 0.125 and 0.25"
-    assert not [line for line in lines if "median of" in line and "lr_star" in line]
-    assert sum("seed=" in line for line in lines) == 3
+    assert sum("seed-" in line for line in lines) == 3
 
 
-def test_runs_of_one_configuration_form_a_group_whatever_their_names(
-    evaluated, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.setenv("COLUMNS", "100")
+def test_runs_of_one_configuration_form_a_group_whatever_their_names(evaluated, tmp_path, capsys):
     model = {"_target_": "dpl.models.FCNN"}
     for name, seed, width in (("a", 0, 8), ("b", 1, 8), ("c", 0, 16), ("d" * 50, 0, 32)):
         (tmp_path / name).mkdir()
@@ -133,8 +131,9 @@ def test_runs_of_one_configuration_form_a_group_whatever_their_names(
         save(evaluated[0], tmp_path / name / "evaluation.json")
     compare(tmp_path)
     out = capsys.readouterr().out
-    assert out.count("median of") == 1
-    assert "median of 2: a" in out
+    assert [line.split()[:4] for line in out.splitlines() if "median of" in line] == [
+        ["median", "of", "2", "8"]
+    ]
     assert max(len(line.rstrip()) for line in out.splitlines()) <= 100
 
 
@@ -146,10 +145,16 @@ def test_an_evaluation_with_other_rows_is_refused_by_its_file(tmp_path):
         compare(tmp_path)
 
 
-def test_runs_of_other_names_are_named_by_the_options_that_differ():
-    options = [{"model": "FCNN", "model.width": 8, "optimizer.lr": rate} for rate in (0.1, 0.2)]
-    names = run_names(["a", "b"], options)
-    assert names == ["a: optimizer.lr=0.1", "b: optimizer.lr=0.2"]
+def test_options_in_which_runs_differ_are_columns_and_swept_ones_come_first():
+    rates = [{"model": "FCNN", "optimizer.lr": rate, "a.seed": k, "b.seed": k, "x.y.z": k + 1}
+             for k, rate in enumerate((0.1, 0.2))]  # fmt: skip
+    names = [f"x.y.z-{k}" for k in (1, 2)]
+    columns = {"z": ["1", "2"], "a.seed": ["0", "1"], "lr": ["0.1", "0.2"]}
+    found = differing_options(names, rates, 100)
+    assert found == columns
+    assert list(found) == list(columns)
+    assert differing_options(names, rates, 5) == {"z": ["1", "2"]}, "there is room for one"
+    assert differing_options(["a", "b"], [rates[0], {}], 100)["z"] == ["1", ""]
 
 
 def test_a_folder_without_evaluated_runs_raises_an_error(tmp_path):

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from dpl.evaluation import tables
 from dpl.export import write_results
+from dpl.export.paraview import ResultRow
 from dpl.fem import box, fields, read_mesh, rectangle, write_mesh, write_series
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
@@ -102,6 +104,12 @@ def test_without_a_reference_solution_the_error_is_nan(make_scene_of, tmp_path):
     rows, _ = write_results(surrogate, loads, tmp_path / "series", solve_reference=False)
     assert np.isnan(rows[0].error)
     assert "error [m]" not in meshio.read(tmp_path / "series_000.vtu").point_data
+
+
+def test_the_table_of_results_has_units_and_per_cent(capsys):
+    tables.show([ResultRow(0, 4500.0, 1.5, 99.0, 0.98, 0.0031)], "results")
+    out = capsys.readouterr().out
+    assert (out.count("[Pa]"), out.count("[m]"), out.count("0.31 %")) == (2, 1, 1)
 
 
 @pytest.mark.parametrize("name", ["tetra", "tetra, quadratic"])

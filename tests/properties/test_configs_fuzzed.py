@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from tried import at_most, counted
 
 from dpl import DataSetError
-from dpl.config import build, run_folder
+from dpl.config import build, plain, run_folder
 from dpl.fem import solve
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -169,7 +169,7 @@ def harmed(draw):
 
 def works(cfg: DictConfig, folder: Path, keys=()) -> None:
     """Make what a command makes before it computes, and let it answer a load."""
-    build.check(cfg, keys=keys)
+    plain.check(cfg, keys=keys)
     if "mesh" not in cfg:
         return
     scene = build.build_scene(cfg)
@@ -329,7 +329,7 @@ def test_a_runs_folder_calls_nothing_but_the_objects_of_a_run(tripwires, cfg):
     made = OmegaConf.create(cfg)
     with bounded():
         with pytest.raises(build.ConfigError):
-            build.check(made, trust=False)
+            plain.check(made, trust=False)
         (tripwires / "run" / "config.yaml").write_text(OmegaConf.to_yaml(made))
         with pytest.raises(build.ConfigError) as refusal:
             run_folder.load_run(tripwires / "run")
@@ -381,7 +381,7 @@ def test_what_a_runs_folder_may_name_is_of_a_kind_that_a_run_is_made_of(name, ke
     cfg = OmegaConf.create({"trainer": {"_target_": "lightning.Trainer"}})
     OmegaConf.update(cfg, key, {"_target_": name}, merge=False)
     try:
-        build.check(cfg, trust=False)
+        plain.check(cfg, trust=False)
     except build.ConfigError:
         return
     module, _, attribute = name.rpartition(".")

@@ -21,8 +21,8 @@ import yaml
 from hydra.core.global_hydra import GlobalHydra
 from PIL import Image
 
+from dpl import config as run
 from dpl.commands import dry_run
-from dpl.config import build as run
 from dpl.fem.linear import BACKENDS
 
 ROOT = Path(__file__).parents[2]

@@ -439,3 +439,6 @@ def test_skipped_work_is_that_of_network_and_loss(scene):
     module = surrogate(scene, MSE())
     assert module.skipped_work() == [*module.net.skipped_work(), *module.loss.skipped_work()]
     assert Surrogate(nn.Identity(), LrPlus(), scene).skipped_work() == []
+    fitted = nn.Identity()
+    fitted.fit = None
+    assert Surrogate(fitted, MSE(), scene).skipped_work() == [], "it has no loss"

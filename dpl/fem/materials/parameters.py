@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.mesh.reading import read_cell_data
 from dpl.fem.mesh.regions import Origin
 from dpl.fem.ranges import ParameterRange, is_range
 from dpl.system.checks import named_errors
@@ -51,6 +50,8 @@ class CellField:
         centres = (mesh.p[:, mesh.t].mean(axis=1).T + origin) * length
         given: Any = self.values
         if self.file is not None:
+            from dpl.fem.mesh.reading import read_cell_data  # which imports meshio
+
             (given,) = read_cell_data(self.file, [str(self.values)])
         elif callable(given):
             given = given(centres)

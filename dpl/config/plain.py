@@ -1,0 +1,169 @@
+"""Configurations as plain data: read, resolve, flatten and check them.
+
+This module imports neither torch nor a class that a configuration names, so that a wrong key or a
+missing run is reported at once.
+"""
+
+import contextlib
+import typing
+import warnings
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from dpl.config import validation
+from dpl.config.validation import ConfigError
+from dpl.system.files import LOADABLE, DataSetError
+
+TAG = "dpl.fem.Tag"  # call of a region that a mesh file names
+MAX_BYTES = 100_000  # of the configuration of a run
+NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its result
+    *("run", "folder", "ckpt_path", "trust", "data.folder"),
+    *("callbacks", "logger", "paths", "extras", "trainer.plugins"),
+}
+
+
+@contextlib.contextmanager
+def error_in(key: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Turn a ValueError, or errors of these kinds, into a `ConfigError` that names a key.
+
+    A `ConfigError` and a `DataSetError` remain what they are: their messages name the place.
+    """
+    kinds = kinds or (ValueError,)
+    try:
+        yield
+    except (ConfigError, DataSetError):
+        raise
+    except kinds as error:
+        raise ConfigError(f"{key}: {error}") from error
+
+
+def to_container(cfg: DictConfig) -> dict[str, Any]:
+    """Return a configuration without interpolations; raise a `ConfigError` for a missing value."""
+    try:
+        return typing.cast(
+            "dict[str, Any]", OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        )
+    except MissingMandatoryValue as error:
+        raise ConfigError(f"{error.full_key} is missing; set it on the command line") from None
+    except OmegaConfBaseException as error:
+        message = str(error.msg or error).splitlines()[0]
+        raise ConfigError(f"{error.full_key or 'config'}: {message}") from None
+
+
+def hyperparameters(cfg: DictConfig, *, without: Collection[str] = ()) -> dict[str, Any]:
+    """Return the hyperparameters of a run, flat: keys of the command line and their values.
+
+    A call has the key of its node and the name of its class (`model`: FCNN). Null, empty lists and
+    `NOT_IDENTITY` are left out, and so are the nodes `without`.
+    """
+    kept = {key: node for key, node in to_container(cfg).items() if key not in without}
+    return dict(_columns(kept, ""))
+
+
+def _columns(node: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+    for key, value in node.items():
+        place = f"{path}.{key}" if path else key
+        if value in (None, []) or place in NOT_IDENTITY:
+            continue
+        if isinstance(value, dict):
+            yield from _columns(value, place)
+        elif key == "_target_":
+            yield path, value.rpartition(".")[2]
+        elif not key.startswith("_"):
+            yield place, str(value) if isinstance(value, list) else value
+
+
+def check(
+    cfg: DictConfig,
+    *,
+    trust: bool = True,
+    keys: validation.Keys = (),
+    first: Collection[str] = (),
+) -> None:
+    """Check a configuration without calling anything, see `dpl.config.validation.check`.
+
+    The nodes of the keys `first` are checked before the others, whose classes take seconds to
+    import.
+    """
+    written = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg))
+    resolved = to_container(cfg)
+    roots = {key.partition(".")[0] for key in first}
+    for chosen in filter(None, (roots & resolved.keys(), resolved.keys())):
+        parts = ({key: node[key] for key in node if key in chosen} for node in (written, resolved))
+        validation.check(*parts, trust=trust, keys=keys)
+
+
+def check_groups(cfg: DictConfig) -> None:
+    """Raise a `ConfigError` if a `dpl.fem.Tag` names no part of the mesh file of a configuration.
+
+    A file that cannot be read is reported by its key when the scene is built.
+    """
+    found = to_container(cfg)
+    calls = {p: node for p, node in validation.iter_nodes(found) if isinstance(node, dict)}
+    tags = {p: node.get("name") for p, node in calls.items() if node.get("_target_") == TAG}
+    file = calls.get("mesh", {})
+    if not tags or file.get("_target_") != "dpl.fem.read_mesh":
+        return
+    from dpl.fem import Tag, read_mesh
+
+    try:
+        with warnings.catch_warnings(action="ignore"):  # printed when the scene is built
+            mesh = read_mesh(**{key: file[key] for key in file if key != "_target_"})
+    except (OSError, MemoryError, TypeError, ValueError):
+        return
+    for place, name in tags.items():
+        with error_in(place):
+            Tag(str(name)).facets(mesh)
+
+
+def require_keys(cfg: DictConfig, *keys: str) -> None:
+    """Raise a `ConfigError` if a key does not exist."""
+    for key in keys:
+        if key not in cfg:
+            raise ConfigError(f"{key} is missing")
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Return the configuration of a run as a dictionary; nothing in it is called or looked up."""
+    try:
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise ValueError(f"has {size:,} bytes, of {MAX_BYTES:,} at most")
+        text = path.read_text()
+        marks = yaml.AnchorToken, yaml.AliasToken  # a few lines can expand to gigabytes
+        if any(isinstance(token, marks) for token in yaml.scan(text, yaml.SafeLoader)):
+            raise ValueError("refers to parts of itself")
+        found: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+        if not isinstance(found, dict):
+            raise ValueError("is no list of keys and values")
+        if any(isinstance(one, str) and "${" in one for _, one in validation.iter_nodes(found)):
+            raise ValueError("holds an interpolation, which no saved run does")
+    except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path} is not the configuration of a run: {reason}") from error
+    return found
+
+
+def files_of_run(folder: str | Path) -> tuple[Path, Path]:
+    """Return the configuration and the best weights of a run.
+
+    Raises:
+        ConfigError: One of them does not exist.
+    """
+    config = Path(folder) / "config.yaml"
+    kept = [Path(folder) / "checkpoints" / name for name in LOADABLE]
+    best = next((path for path in kept if path.exists()), kept[-1])
+    for path in (config, best):
+        if not path.is_file():
+            raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
+    return config, best
+
+
+def options_of_run(folder: Path) -> dict[str, Any]:
+    """Return the hyperparameters of a run, see `hyperparameters`; none without configuration."""
+    path = folder / "config.yaml"
+    return hyperparameters(OmegaConf.create(read_config(path))) if path.is_file() else {}

@@ -1,0 +1,83 @@
+"""A surrogate without its training; this module does not import Lightning, which takes seconds."""
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from dpl.fem import Load
+from dpl.models.inputs import Base
+from dpl.models.linear_base import SCALE_STREAM
+from dpl.scene import Scene
+from dpl.training.predictors import predictor_of
+
+
+class TrainedSurrogate(nn.Module):
+    """A network that predicts the displacement in equilibrium with a load.
+
+    `forward` takes newtons and pascals and returns metres; `predict` is dimensionless.
+
+    Attributes:
+        predictor: The network with its scales, perhaps on the linear solution, see `Predictor`.
+        scene: The scene.
+        largest_force: Norm of the largest force of the loads, () [-].
+    """
+
+    largest_force: Tensor
+
+    def __init__(
+        self, net: nn.Module, scene: Scene, *, base: Base | None = None, young: bool = False
+    ) -> None:
+        """Combine a network and a scene; the arguments are those of `Surrogate`."""
+        super().__init__()
+        self.predictor, self.scene = predictor_of(net, scene, base, young=young), scene
+        largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
+        self.register_buffer("largest_force", largest_force)
+
+    @property
+    def net(self) -> nn.Module:
+        """The network."""
+        return self.predictor.net
+
+    def forward(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Return displacements (B, N, D) [m] under nodal forces (B, N, D) [N].
+
+        Args:
+            force: Nodal forces, (B, N, D) [N].
+            young: Young's moduli, (B,) [Pa].
+            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
+        """
+        return self.scene.length * self.predict(self.scene.load_of(force, young, parameters))
+
+    def predict(self, load: Load) -> Tensor:
+        """Return displacements over L, (B, N, D) [-], float64."""
+        return cast(Tensor, self.predictor(load))
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
+        """Load weights; the arguments are those of `torch.nn.Module`.
+
+        Raises:
+            ValueError: A tensor has another type, is not finite, or is none that a fit can give.
+            RuntimeError: The weights are of another network.
+        """
+        own = self.state_dict()
+        if "force_scale" in state_dict:
+            raise ValueError("was written by an earlier version of dpl; train the run again")
+        for name, stored in state_dict.items():
+            dtype = own[name].dtype if name in own else stored.dtype
+            if stored.dtype != dtype and not stored.is_floating_point() & dtype.is_floating_point:
+                raise ValueError(f"{name} of {stored.dtype} must be of {dtype}")
+            if not stored.to(dtype).isfinite().all():
+                raise ValueError(f"{name} must be finite")
+        found = super().load_state_dict(state_dict, *args, **options)
+        if not self.largest_force > 0:
+            raise ValueError(f"largest_force = {float(self.largest_force)} must be above 0")
+        return found
+
+    def check_predictions(self) -> None:
+        """Raise ValueError if a prediction of a load of the scene is not finite."""
+        load = self.scene.loads.sample((0, SCALE_STREAM), range(2))
+        with torch.no_grad():  # tensors that a network keeps are used for derivatives, too
+            if not self.predict(load).isfinite().all():
+                raise ValueError("the answers of the network are not finite")
