@@ -3,6 +3,7 @@
 All functions need an initialised Hydra (`dpl.commands.dry_run.initialized`).
 """
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,6 +23,7 @@ from dpl.config import ConfigError, validation
 from dpl.version import install
 
 EXTRAS = {"hydra/launcher": "launch", "hydra/sweeper": "sweep"}  # groups with options of plugins
+GROUP = re.compile(r"[\w.:][\w .:+-]*")  # a name of a group of a mesh that needs no quotes
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, AssertionError, TypeError)
 
 
@@ -38,6 +40,16 @@ def options(name: str, group: str) -> list[str]:
 def defaults(name: str, lines: list[str]) -> list[ResultDefault]:
     """Return the files that a configuration is composed of, in their order."""
     return list(_loader().compute_defaults_list(name, lines, RunMode.RUN).defaults)
+
+
+def with_named_region(name: str, lines: Sequence[str]) -> list[str]:
+    """Return overrides in which `fixed=GROUP`, a group of the mesh, selects `fixed/tag.yaml`."""
+    found: list[str] = []
+    for line in lines:
+        key, _, group = line.partition("=")
+        is_option = group in ("null", *options(name, key)) or not GROUP.fullmatch(group)
+        found += [line] if key != "fixed" or is_option else ["fixed=tag", f"fixed.name={group}"]
+    return found
 
 
 def parsed(line: str) -> Override:

@@ -22,7 +22,7 @@ from dpl.config.build import (
     build_surrogate,
     hyperparameters,
     instantiate,
-    moduli,
+    law_and_moduli,
     require_keys,
     to_container,
 )
@@ -64,6 +64,8 @@ def with_copied_files(
         files[key] = path, own
         if os.path.isfile(own) and own.resolve().parent == folder.resolve():
             call[option] = str(own)
+            if is_mesh:  # written in metres
+                call.pop("scale", None)
         elif required:
             remedy = "write it there by dpl.fem.write_mesh_exactly" if is_mesh else "copy it there"
             raise ConfigError(
@@ -201,7 +203,7 @@ def _scene_of_run(
 
 def _reused_or_built(cfg: DictConfig, known: Scene | None) -> Scene:
     """Return a known scene if it has the size and the moduli of a configuration, else a new one."""
-    if known is None or moduli(cfg) != known.loads.moduli:
+    if known is None or law_and_moduli(cfg)[1] != known.loads.moduli:
         return build_scene(cfg)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # printed when the scene was built
