@@ -10,7 +10,7 @@ import skfem
 from skfem.io.meshio import to_meshio
 
 from dpl import fem
-from dpl.fem.mesh import facets_in, nodes_in
+from dpl.fem.mesh import facets_in, group_names, nodes_in
 
 pytestmark = pytest.mark.usefixtures("in_process")
 
@@ -268,6 +268,22 @@ def test_physical_groups_of_gmsh_are_tags_by_name_or_by_number(tmp_path):
         "body": [0, 1],
         "far cell": [1],
     }
+
+
+def test_groups_that_gmsh_numbers_are_hidden_unless_there_are_no_others(tmp_path):
+    (tmp_path / "bar.msh").write_text(GMSH_41)
+    mesh = fem.read_mesh(tmp_path / "bar.msh")
+    assert "gmsh:geometrical=1" in mesh.subdomains
+    assert facets_in("held end", mesh).size == 1
+    assert group_names(mesh) == ["7", "body", "far cell", "held end"]
+    with pytest.raises(ValueError, match=r"'lid' must be .*: '7', 'body', 'far cell', 'held end'$"):
+        facets_in("lid", mesh)
+    fem.write_mesh(tmp_path / "bar.vtu", mesh, {})
+    assert set(meshio.read(tmp_path / "bar.vtu").cell_data) == {
+        *("skfem:s:body", "skfem:s:far cell", "skfem:b:held end", "skfem:b:7")
+    }
+    bare = fem.box(*BAR).with_boundaries({"gmsh:geometrical=4": np.array([0])})
+    assert group_names(bare) == ["gmsh:geometrical=4"]
 
 
 def side_blocks(mesh: skfem.Mesh, facets) -> tuple[str, np.ndarray]:
