@@ -384,6 +384,8 @@ def _describe(hint: Any) -> str:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
         return " or ".join(map(_describe, arguments))
+    if origin is Callable:
+        return "a call"
     if origin is Literal:
         return f"one of {', '.join(map(str, arguments))}"
     if origin is Mapping:

@@ -64,6 +64,7 @@ BAD = {  # override -> what the message must name
     "mesh=file mesh.path=nowhere.msh": r"mesh: nowhere\.msh: no such mesh file",
     "mesh=file mesh.path=12": r"mesh\.path = 12 must be",
     "fixed.at=7": r"fixed.*Plane\(axis=0, at=7\) holds no node",
+    "loads=traction loads.region=7": r"loads.region = 7 must be a call or .* or a text or null$",
     "fixed.axis=3": r"fixed: axis = 3",
     "fixed.at=middle": r"fixed: at = 'middle'",
     "mesh=rectangle fixed.axis=2": r"fixed.*axis = 2 must be less than 2",
