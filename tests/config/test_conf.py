@@ -440,6 +440,7 @@ def test_moduli_in_pascal_decide_youngs_modulus(scene_of):
 def test_the_range_of_a_modulus_is_in_pascal(scene_of):
     scene = scene_of(*SMALL["beam"], "material=yeoh_k2", "material.c10=[0.1e6,0.3e6]")
     assert scene.problem.parameter_ranges == {"c10": (0.1e6, 0.3e6)}
+    assert scene.problem.material.units_of_ranges == {"c10": 1 / scene.loads.moduli[0]}
     assert scene.loads.moduli[0] == pytest.approx(2 * 0.4e6 * 1.4)
     soft, stiff = (scene.problem.with_parameters(torch.tensor([[c]])) for c in (0.1e6, 0.3e6))
     assert float(stiff.material.mu / soft.material.mu) == pytest.approx(3)

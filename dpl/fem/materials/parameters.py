@@ -152,6 +152,12 @@ class Parametrised:
         return {name: v for name, v in values.items() if isinstance(v, ParameterRange)}
 
     @property
+    def units_of_ranges(self) -> dict[str, float | None]:
+        """Unit of each range over E [-], by name; None for a number without unit."""
+        names = self.parameter_ranges
+        return {name: self.unit if name in self.dimensional else None for name in names}
+
+    @property
     def rest_moduli(self) -> Tensor:
         """Moduli at rest of all cells, a vector (1, M) or (B, M) [-], see `linear_law`."""
         raise NotImplementedError
@@ -273,6 +279,12 @@ class Composed(Parametrised):
         """Ranges of the parts, by name, see `Parametrised.parameter_ranges`."""
         pairs = [(key, part.parameter_ranges.items()) for key, part in self.parts.items()]
         return {f"{key}.{name}": ends for key, ranges in pairs for name, ends in ranges}
+
+    @property
+    def units_of_ranges(self) -> dict[str, float | None]:
+        """Units of the ranges of the parts, see `Parametrised.units_of_ranges`."""
+        pairs = [(key, part.units_of_ranges.items()) for key, part in self.parts.items()]
+        return {f"{key}.{name}": unit for key, units in pairs for name, unit in units}
 
     @property
     def rest_moduli(self) -> Tensor:
