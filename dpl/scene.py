@@ -230,7 +230,8 @@ class Scene:
 
     def describe(self) -> list[tuple[str, str]]:
         """Return names and values of the body, its supports, its law and its loads."""
-        problem, loads = self.problem, self.loads
+        problem, loads, law = self.problem, self.loads, self.problem.material
+        log = ", uniform in log E" if loads.moduli.is_log else ""
         sides = (problem.points.amax(dim=0) - problem.points.amin(dim=0)) * self.length
         cells = CELLS[problem.mesh.elem.refdom.name]
         fixed = int((~problem.free).any(dim=1).sum())
@@ -251,7 +252,7 @@ class Scene:
                 f"{problem.points.numel():,} degrees of freedom",
             ),
             ("supports", f"{fixed:,} nodes {moved}{springs}"),
-            ("law", f"{problem.material.describe()}, {_modulus(loads.moduli)}"),
+            ("law", f"{law.describe()}, {law.describe_rest(loads.moduli)}{log}"),
             (
                 "loads",
                 f"{type(loads).__name__}; the largest of {FEW}: {force:.3g} {unit}{bends}",

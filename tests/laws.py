@@ -8,9 +8,12 @@ from omegaconf import OmegaConf
 from dpl.fem import FibreReinforced, InvariantBasedMaterial, Material, YoungPoissonMaterial
 
 FILES = sorted((Path(__file__).parents[1] / "conf" / "material").glob("*.yaml"))
-NODES = {path.stem: OmegaConf.load(path) for path in FILES}
-LAWS: dict[str, Material] = {  # not those of several regions
-    name: instantiate(node, _convert_="all") for name, node in NODES.items() if "_target_" in node
+LOADED = {path.stem: OmegaConf.load(path) for path in FILES}
+NODES = {name: node.get("material", node) for name, node in LOADED.items()}
+LAWS: dict[str, Material] = {  # not those of several regions; Young's modulus at rest is 1
+    name: instantiate(node, _convert_="all").normalised()
+    for name, node in NODES.items()
+    if "_target_" in node
 }
 HOOKEAN = [type(law) for law in LAWS.values() if isinstance(law, YoungPoissonMaterial)]
 COMPILED = [name for name, law in LAWS.items() if isinstance(law, InvariantBasedMaterial)]

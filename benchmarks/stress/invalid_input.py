@@ -140,7 +140,7 @@ def empty_regions(auditor: Auditor) -> Outcome:
     found = []
     for use, call in REGION_USES.items():
         for where, region in EMPTY_REGIONS.items():
-            words = "no tags at all" if where == "tag" else "holds no"
+            words = "must be a group of the mesh" if where == "tag" else "holds no"
             found.append(expect_error(f"{use}, {where}", partial(call, mesh, region), words))
     return _counted(found)
 

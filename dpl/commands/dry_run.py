@@ -53,7 +53,10 @@ def arguments_of(line: Sequence[str], name: str, conf: Path) -> Namespace:
 
 @contextlib.contextmanager
 def initialized(args: Namespace) -> Iterator[Hydra]:
-    """Let Hydra search the folder of the configurations and that of `--config-dir`."""
+    """Let Hydra search the folder of the configurations and that of `--config-dir`.
+
+    Replaces the override `fixed=GROUP` of a group of the mesh.
+    """
     search = create_config_search_path(str(Path(args.config_path).absolute()))
     if args.config_dir is not None:
         own = Path(args.config_dir).absolute()
@@ -61,7 +64,9 @@ def initialized(args: Namespace) -> Iterator[Hydra]:
             raise ConfigError(f"--config-dir = {args.config_dir} must be an existing folder")
         search.prepend("command-line", f"file://{own}", SearchPathQuery(provider="schema"))
     try:
-        yield Hydra.create_main_hydra2(args.config_name, search)
+        engine = Hydra.create_main_hydra2(args.config_name, search)
+        args.overrides = overrides.with_named_region(args.config_name, args.overrides)
+        yield engine
     finally:
         GlobalHydra.instance().clear()
 

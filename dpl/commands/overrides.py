@@ -25,6 +25,7 @@ from dpl.version import install
 
 EXTRAS = {"hydra/launcher": "launch", "hydra/sweeper": "sweep"}  # groups with options of plugins
 SIMILAR = 0.8  # ratio of `difflib` from which a key is taken for a misspelt one
+GROUP = re.compile(r"[\w.:][\w .:+-]*")  # a name of a group of a mesh that needs no quotes
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, AssertionError, TypeError)
 
 
@@ -41,6 +42,16 @@ def options(name: str, group: str) -> list[str]:
 def defaults(name: str, lines: list[str]) -> list[ResultDefault]:
     """Return the files that a configuration is composed of, in their order."""
     return list(_loader().compute_defaults_list(name, lines, RunMode.RUN).defaults)
+
+
+def with_named_region(name: str, lines: Sequence[str]) -> list[str]:
+    """Return overrides in which `fixed=GROUP`, a group of the mesh, selects `fixed/tag.yaml`."""
+    found: list[str] = []
+    for line in lines:
+        key, _, group = line.partition("=")
+        is_option = group in ("null", *options(name, key)) or not GROUP.fullmatch(group)
+        found += [line] if key != "fixed" or is_option else ["fixed=tag", f"fixed.name={group}"]
+    return found
 
 
 def parsed(line: str) -> Override:

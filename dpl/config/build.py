@@ -19,14 +19,14 @@ import hydra
 import skfem
 import torch
 from hydra.errors import InstantiationException
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from dpl import models, training
 from dpl.config import validation
 from dpl.config.plain import error_in, require_keys
 from dpl.config.validation import ConfigError
-from dpl.fem import ParameterRange, Problem, SingularMatrix
+from dpl.fem import Heterogeneous, Material, ParameterRange, Problem, SingularMatrix
 from dpl.fem.assembly.follower_loads import FollowerLoad
 from dpl.fem.units import Units
 from dpl.scene import Scene
@@ -69,7 +69,8 @@ def instantiate(cfg: DictConfig, key: str, /, **more: Any) -> Any:
 
 def _made(node: Any, place: str, more: dict[str, Any]) -> Any:
     try:
-        made = hydra.utils.instantiate(node, _convert_="all")
+        # the name of a group of the mesh is a value
+        made = hydra.utils.instantiate(node, _convert_="all") if OmegaConf.is_config(node) else node
         return made(**more) if more else made
     except CANNOT_BE_MADE as error:
         wrapped = isinstance(error, InstantiationException) and error.__cause__
@@ -96,33 +97,62 @@ def _of_kind(made: Any, key: str, place: str) -> Any:
 def build_scene(cfg: DictConfig) -> Scene:
     """Return the scene of a configuration; raise a `ConfigError` that names the invalid key."""
     require_keys(cfg, *SCENE)
-    young, ends = _young(cfg), moduli(cfg)
+    law, ends = law_and_moduli(cfg)
     forces = _parts(cfg, "forces")
     follower = {name: f for name, f in forces.items() if isinstance(f, FollowerLoad)}
-    problem = _problem(cfg, ends[0] if ends[0] == ends[1] else None, follower)
+    problem = _problem(cfg, law, ends[0] if ends[0] == ends[1] else None, follower)
     dead = {name: force for name, force in forces.items() if name not in follower}
     always = _constant_force(dead, problem)
     solver = instantiate(cfg, "solver", problem=problem)
     linear = solver.linear_solver
-    loads = instantiate(cfg, "loads", linear=linear, young=young, constant_force=always)
+    loads = instantiate(cfg, "loads", linear=linear, young=ends, constant_force=always)
     singular = "material, mesh, fixed or supports: K(0) cannot be used"
     with error_in("loads"), error_in(singular, SingularMatrix):
         loads.largest_force  # noqa: B018  # raises if the body does not allow these loads
     return Scene(problem, loads, solver)
 
 
-def _young(cfg: DictConfig) -> Any:
-    """Return the value of `young`, a mapping or a list if it is a range [Pa]."""
-    is_range = isinstance(cfg.young, ListConfig | DictConfig)
-    return OmegaConf.to_container(cfg.young) if is_range else cfg.young
+def law_and_moduli(cfg: DictConfig) -> tuple[Material, ParameterRange]:
+    """Return the law, its moduli over E, and the range of Young's moduli E of all loads [Pa].
 
+    The moduli of a law have one unit, see `dpl.fem.materials.parameters.Scalable`:
 
-def moduli(cfg: DictConfig) -> ParameterRange:
-    """Return the range of Young's moduli of all loads; raise a `ConfigError` if it is invalid."""
+    - `young: null`: the unit is Pa. E is Young's modulus at rest of the law; of several laws that
+      of the softest one.
+    - `young` is a number or a range: E is `young`. A single law with constants of its own
+      (c10, ..., bulk) is scaled so that E is its modulus at rest. Moduli of regions and of laws
+      with fibres are over E.
+
+    Where constants have ranges, their middles decide.
+
+    Raises:
+        ConfigError: The law, its regions or `young` are invalid.
+    """
+    law, regions = _law(cfg), _parts(cfg, "regions")
+    if isinstance(law, dict):
+        try:
+            law = Heterogeneous(law, regions)
+        except ValueError as error:  # its message names the key
+            raise ConfigError(str(error)) from error
+    elif regions:
+        raise ConfigError("regions: the body has one law; give each region one, material.NAME")
+    if cfg.young is None:
+        with error_in("young = null: material"):
+            young = law.young_at_rest
+            return law.over(young), ParameterRange(young, young)
+    given = OmegaConf.to_container(cfg.young) if OmegaConf.is_config(cfg.young) else cfg.young
     try:
-        return ParameterRange.of_young(_young(cfg))
+        moduli = ParameterRange.of_young(typing.cast("Any", given))
     except ValueError as error:  # its message names the key
         raise ConfigError(str(error)) from error
+    with error_in("material"):
+        return law.normalised(), moduli
+
+
+def _law(cfg: DictConfig) -> Any:
+    """Return the law, or the laws of regions by name."""
+    several = validation.names_several("material", cfg.material)
+    return _parts(cfg, "material") if several else instantiate(cfg, "material")
 
 
 def _constant_force(dead: dict[str, Any], problem: Problem) -> Tensor | None:
@@ -143,27 +173,24 @@ def _supports(cfg: DictConfig, mesh: skfem.Mesh, units: Units) -> list[Any]:
     return list(supports.values())
 
 
-def _problem(cfg: DictConfig, young: float | None, follower: Mapping[str, FollowerLoad]) -> Problem:
+def _problem(
+    cfg: DictConfig, law: Material, young: float | None, follower: Mapping[str, FollowerLoad]
+) -> Problem:
     with _shown_warnings():
-        mesh, regions = instantiate(cfg, "mesh"), _parts(cfg, "regions")
-        several = validation.names_several("material", cfg.material)
-        material = _parts(cfg, "material") if several else instantiate(cfg, "material")
-        if regions and not several:
-            raise ConfigError("regions: the body has one law; give each region one, material.NAME")
+        mesh = instantiate(cfg, "mesh")
         fixed = instantiate(cfg, "fixed") if cfg.get("fixed") is not None else None
         options = {key: cfg[key] for key in ("degree", "mean_dilatation")} | {"young": young}
         supports = _supports(cfg, mesh, Units(1.0, young))
-        options["regions"] = regions
         options["follower_loads"] = [
             replace(typing.cast("Any", load), name=load.name or name)
             for name, load in follower.items()
         ]
         try:
-            problem = Problem.build(mesh, material, fixed=fixed, supports=supports, **options)
+            problem = Problem.build(mesh, law, fixed=fixed, supports=supports, **options)
         except ValueError as error:
             message = str(error).replace("follower_loads", "forces", 1)
             key = "fixed or supports: " if cfg.supports else "fixed: "
-            named = message.startswith((*options, "material", "forces"))
+            named = message.startswith((*options, "regions", "material", "forces"))
             raise ConfigError(message if named else key + message) from error
     if not problem.free.any():
         raise ConfigError("fixed or supports: all nodes are fixed; fix fewer nodes")

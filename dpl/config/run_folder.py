@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpl import data, inference, training
 from dpl.config import validation
-from dpl.config.build import SCENE, build_scene, build_trained, instantiate, moduli
+from dpl.config.build import SCENE, build_scene, build_trained, instantiate, law_and_moduli
 from dpl.config.plain import files_of_run, read_config, require_keys, to_container
 from dpl.config.validation import ConfigError
 from dpl.fem.mesh.generators import longest_side
@@ -56,6 +56,8 @@ def with_copied_files(
         files[key] = path, own
         if os.path.isfile(own) and own.resolve().parent == folder.resolve():
             call[option] = str(own)
+            if is_mesh:  # written in metres
+                call.pop("scale", None)
         elif required:
             remedy = "write it there by dpl.fem.write_mesh_exactly" if is_mesh else "copy it there"
             raise ConfigError(
@@ -172,7 +174,7 @@ def _scene_of_run(
 
 def _reused_or_built(cfg: DictConfig, known: Scene | None) -> Scene:
     """Return a known scene if it has the size and the moduli of a configuration, else a new one."""
-    if known is None or moduli(cfg) != known.loads.moduli:
+    if known is None or law_and_moduli(cfg)[1] != known.loads.moduli:
         return build_scene(cfg)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # printed when the scene was built

@@ -18,7 +18,8 @@ Keys = Sequence[tuple[Any, ...]]  # rows of type, names, and smallest and larges
 BELOW_1 = math.nextafter(1.0, 0.0)  # largest value of a key that must be below 1
 KEYS: Keys = (  # of all commands
     (dict, "mesh material loads solver data model loss optimizer trainer"),
-    (dict | None, "fixed regions supports forces scheduler callbacks logger"),
+    (dict | str | None, "fixed"),
+    (dict | None, "regions supports forces scheduler callbacks logger"),
     (Mapping[str, float | str | bool | None] | None, "paths extras"),
     (bool, "mean_dilatation trust resume solve_reference"),
     (str, "name host"),
@@ -38,7 +39,7 @@ KEYS: Keys = (  # of all commands
     (Sequence[float], "tols", 1e-15, BELOW_1),
     (Sequence[float], "errors", 1e-15, 1),
     (Sequence[int | None], "threads", 1, 10**4),
-    (float | Sequence[float] | Mapping[str, float | str], "young", 1e-30, 1e30),  # [Pa]
+    (float | Sequence[float] | Mapping[str, float | str] | None, "young", 1e-30, 1e30),  # [Pa]
     (float, "young.low young.high", 1e-30, 1e30),
     (Literal["uniform", "log"], "young.distribution"),
     # of a training; the types are those of signatures, 1e-30 stands for "above 0"
@@ -50,7 +51,10 @@ KEYS: Keys = (  # of all commands
 )
 UNLIMITED = {"trainer.max_epochs", "trainer.max_steps"}  # keys for which -1 means no limit
 NOT_EMPTY = {"tols", "threads"}  # lists that must name a value
-REGIONS = {f"dpl.fem.mesh.regions.{name}" for name in ("Plane", "Box", "Sphere", "Cylinder", "Tag")}
+REGIONS = {  # a region is a call, or the name of a group of the mesh
+    *(f"dpl.fem.mesh.regions.{name}" for name in ("Plane", "Box", "Sphere", "Cylinder", "Tag")),
+    "builtins.str",
+}
 EXPECTED_TYPES = {  # base classes of the object that the call under a key returns
     "mesh": {"skfem.mesh.mesh.Mesh"},
     "material": {"dpl.fem.materials.material.Material"},
@@ -160,7 +164,9 @@ def check(
             if path == "data":
                 _check_data(node["_target_"], target, resolved)
             _check_call(path, node, target)
-        elif _is_call(path, resolved) and node is not None:
+        elif _is_call(path, resolved) and not is_instance_of(type(node), _kinds(path, resolved)):
+            if node is None:
+                continue
             raise ConfigError(f"{path} = {node!r} must be a call: its _target_ is missing")
 
 
@@ -378,6 +384,8 @@ def _describe(hint: Any) -> str:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
         return " or ".join(map(_describe, arguments))
+    if origin is Callable:
+        return "a call"
     if origin is Literal:
         return f"one of {', '.join(map(str, arguments))}"
     if origin is Mapping:

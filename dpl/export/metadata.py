@@ -1,5 +1,6 @@
 """Contents of `meta.json` and a reference load: what a program needs to use a surrogate."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,10 @@ def describe(
 def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
     """Return file and operator set, and name, shape, type and unit of each input and output."""
     scene = graph.surrogate.scene
-    stresses = scene.problem.follower_loads.ranges
+    problem, young = scene.problem, scene.loads.moduli[1]
+    units = problem.material.units_of_ranges.items()
+    pascals = {name for name, unit in units if unit and math.isclose(unit * young, 1)}
+    pascals.update(problem.follower_loads.ranges)
     loads, field = scene.loads, ["B", *scene.problem.shape]
     known: dict[str, dict[str, Any]] = {
         "force": {"shape": field, "type": "float64", "unit": _force_unit(scene)},
@@ -82,7 +86,7 @@ def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
         "parameters": {
             "shape": ["B", len(loads.parameter_ranges)],
             "type": "float64",
-            "unit": ["Pa" if name in stresses else "1" for name in loads.parameter_ranges],
+            "unit": ["Pa" if name in pascals else "1" for name in loads.parameter_ranges],
             "ranges": loads.parameter_ranges,
         },
         "displacement": {"shape": field, "type": "float64", "unit": "m"},

@@ -15,7 +15,13 @@ from torch import Tensor
 
 from dpl.fem.assembly.boundary_conditions import FoundationMatrix, Support, assemble_constraints
 from dpl.fem.assembly.discretisation import Discretisation
-from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients, locking_warnings
+from dpl.fem.assembly.elements import (
+    QUADRATIC,
+    QUADRATICALLY,
+    basis_of,
+    gradients,
+    locking_warnings,
+)
 from dpl.fem.assembly.equilibrium import relative_norm, relative_rounding
 from dpl.fem.assembly.follower_loads import NO_LOADS, FollowerLoad, FollowerLoads
 from dpl.fem.assembly.kernels import CompiledLoops
@@ -184,7 +190,7 @@ class Problem:
         if mean_dilatation and mesh.elem.refdom.name not in ("Quadrilateral", "Hexahedral"):
             raise ValueError(
                 "mean_dilatation: applies to quadrilaterals and hexahedra only; "
-                "set degree=2 instead, quadratic elements hardly lock"
+                f"{QUADRATICALLY}; quadratic elements hardly lock"
             )
         units = Units(length, young)
         given, springs = assemble_constraints(

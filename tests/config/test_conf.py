@@ -13,6 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from laws import LAWS
 from omegaconf import OmegaConf
+from skfem.io.meshio import to_meshio
 
 from dpl.config import ConfigError, build, plain
 from dpl.data.solving.solve import LoadKey, solve_load
@@ -180,11 +181,11 @@ def usual():
 def test_an_option_changes_only_its_group_and_passes_the_check(
     compose, usual, overrides, group, name
 ):
-    """Recipes that change several groups are experiments."""
+    """Recipes that change several groups are experiments; a law in Pa decides `young`."""
     cfg = compose(*overrides(group, name), "folder=.", "run=x", command="train")
     plain.check(cfg)
     assert_holds(cfg, group, name)
-    assert {key for key in cfg if cfg[key] != usual[key]} <= {group}
+    assert {key for key in cfg if cfg[key] != usual[key]} <= {group, "young"}
 
 
 def assert_holds(cfg, group, name):
@@ -349,6 +350,90 @@ def test_the_distribution_of_the_moduli_is_one_key_of_the_experiments(scene_of):
 def test_propeller_is_held_at_its_bore_by_name_or_by_place(scene_of, fixed):
     scene = scene_of("mesh=propeller", *fixed)
     assert int((~scene.problem.free).all(dim=1).sum()) == 175
+
+
+@pytest.fixture
+def named_part(tmp_path) -> list[str]:
+    """Overrides for a bar of 4 x 1 x 2 mm with named faces and cells, in a file in millimetres."""
+    mesh = box([4.0, 1.0, 2.0], [5, 2, 3])
+    flat = to_meshio(mesh)
+    ends = {"foot": mesh.p[0] == 0, "top": mesh.p[0] == 4}
+    file = meshio.Mesh(
+        flat.points,
+        flat.cells,
+        point_sets={name: np.flatnonzero(inside) for name, inside in ends.items()},
+        cell_sets={"half": [np.flatnonzero(mesh.p[0, mesh.t].max(axis=0) <= 2)]},
+    )
+    meshio.write(tmp_path / "part.inp", file)
+    return ["mesh=file", f"mesh.path={tmp_path / 'part.inp'}", "mesh.scale=1e-3", "fixed=tag"]
+
+
+PARTS = (
+    "loads=traction loads.region=%top% "
+    "+supports.slide={_target_:dpl.fem.DirichletBC,region:%top%,value:[null,0,null]} "
+    "+forces.p={_target_:dpl.fem.Traction,region:%top%,value:[1,0,0]} "
+    "material=regions +regions.core=%half%"
+)
+
+
+def test_a_string_is_a_group_of_the_mesh_wherever_a_region_is_expected(compose, named_part):
+    scenes = []
+    for form in (r"\1", r"{_target_:dpl.fem.Tag,name:\1}"):
+        lines = re.sub("%(.*?)%", form, PARTS).split()
+        cfg = compose(*named_part, "fixed.name=foot", *lines)
+        if form == r"\1":
+            cfg.fixed = "foot"
+        build.check(cfg)
+        scenes.append(build.build_scene(cfg))
+    assert scenes[0].length == pytest.approx(4e-3)
+    assert scenes[0].fingerprint == scenes[1].fingerprint
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ("fixed.name=lid", "fixed"),
+        ("loads=traction loads.region=lid", "loads"),
+        ("+forces.p={_target_:dpl.fem.Traction,region:lid,value:[1,0,0]}", r"forces\.p"),
+        ("+supports.s={_target_:dpl.fem.DirichletBC,region:lid}", "fixed or supports"),
+        ("material=regions +regions.core=lid", r"material\.core"),
+    ],
+)
+def test_an_unknown_group_is_one_line_that_lists_the_groups(scene_of, named_part, change, key):
+    known = "'lid' must be a group of the mesh: 'foot', 'half', 'top'"
+    with pytest.raises(ConfigError, match=f"^{key}: .*{known}$"):
+        scene_of(*named_part, "fixed.name=foot", *change.split())
+
+
+def test_the_scale_of_a_mesh_file_is_a_positive_length(scene_of, named_part):
+    with pytest.raises(ConfigError, match=r"mesh: scale = 0.0 must be a number above 0"):
+        scene_of(*named_part, "fixed.name=foot", "mesh.scale=0.0")
+
+
+def test_moduli_in_pascal_decide_youngs_modulus(scene_of):
+    """Mooney-Rivlin with 2 (c10 + c01) = 0.4225 MPa, of Treloar's rubber: E = 2 mu (1 + nu)."""
+    small = [*SMALL["beam"], "material=mooney_rivlin_k2", "material.poisson=0.45"]
+    scene = scene_of(*small)
+    assert scene.loads.moduli[0] == pytest.approx(2 * 0.4225e6 * 1.45, rel=1e-4)
+    assert scene.problem.material.mu * 2.9 == pytest.approx(1)
+    assert "E = 1.225e+06 Pa, mu = 4.225e+05 Pa, K = 4.084e+06 Pa, nu = 0.45" in str(
+        scene.describe()
+    )
+    bulk = scene_of(*small[:-1], "material.poisson=null", "material.bulk=4.0842e6")
+    assert bulk.loads.moduli[0] == pytest.approx(scene.loads.moduli[0], rel=1e-4)
+    kilo = ["material.c10=184.84", "material.c01=26.41", "young=1e6"]
+    relative = scene_of(*small, *kilo)
+    assert relative.loads.moduli == (1e6, 1e6)
+    assert relative.problem.material.mu == pytest.approx(float(scene.problem.material.mu))
+
+
+def test_the_range_of_a_modulus_is_in_pascal(scene_of):
+    scene = scene_of(*SMALL["beam"], "material=yeoh_k2", "material.c10=[0.1e6,0.3e6]")
+    assert scene.problem.parameter_ranges == {"c10": (0.1e6, 0.3e6)}
+    assert scene.problem.material.units_of_ranges == {"c10": 1 / scene.loads.moduli[0]}
+    assert scene.loads.moduli[0] == pytest.approx(2 * 0.4e6 * 1.4)
+    soft, stiff = (scene.problem.with_parameters(torch.tensor([[c]])) for c in (0.1e6, 0.3e6))
+    assert float(stiff.material.mu / soft.material.mu) == pytest.approx(3)
 
 
 def test_families_of_a_mixture_are_added_changed_and_removed_by_name(scene_of):

@@ -270,7 +270,7 @@ def test_invalid_directions_are_an_error(build, message):
         (fem.FibreFunction(lambda x: (x, x)), r"sheet must not be parallel to fibre \(cells 0, 1"),
         (fem.FibreFunction(lambda x: 0 * x), r"fibre must be finite and not zero \(cells 0, 1"),
         (wall(outer=fem.Tag("inner")), "inner and outer must not touch"),
-        (wall(outer=fem.Tag("nothing")), "the mesh has 'inner', 'outer'"),
+        (wall(outer=fem.Tag("nothing")), "a group of the mesh: 'inner', 'outer'"),
     ],
 )
 def test_directions_that_do_not_fit_the_body_are_an_error(spec, message):

@@ -218,7 +218,7 @@ BROKEN = {
         "laws": {"core": fem.NeoHookeanLn(0.3), "other": fem.NeoHookeanLn(0.3)},
         "regions": {"core": fem.Box([5.0, 0.0, 0.0], [6.0, 1.0, 1.0])},
     },
-    "material.cor: Tag.*no tags at all; define regions.cor": {
+    "material.cor: 'cor' must be a group of the mesh, which has none; define regions.cor": {
         "laws": {"cor": fem.NeoHookeanLn(0.3), "other": fem.NeoHookeanLn(0.3)},
         "regions": {},
     },

@@ -7,7 +7,7 @@ from itertools import cycle
 
 import pytest
 import torch
-from laws import HOOKEAN, LAWS
+from laws import HOOKEAN, ISOTROPIC, LAWS
 from scipy.optimize import brentq, minimize_scalar
 from torch import Tensor
 from torch.testing import assert_close
@@ -48,6 +48,11 @@ class EnergyAlone(fem.Material):
         return self.law.energy(H)
 
 
+TABULATED = LAWS | {  # the laws of the tables, moduli over a unit
+    "mooney_rivlin_k2": fem.MooneyRivlinK2(0.15, 0.05, 2.0),
+    "yeoh_k2": fem.YeohK2(0.2, -0.02, 0.005, 2.0),
+    "ogden_k2": fem.OgdenK2([0.3, 0.1, 0.02], [1.3, 5.0, -2.0], 2.0),
+}
 UNIAXIAL = {  # lateral stretch and P11 at each of STRETCHES, by an independent root finder
     "saint_venant_kirchhoff": [
         (1.0737784, -0.1785),
@@ -234,11 +239,49 @@ def rotation() -> Tensor:
 
 
 @pytest.mark.parametrize("name", UNIAXIAL)
-def test_uniaxial_tension_has_the_tabulated_lateral_stretch_and_stress(laws, name):
+def test_uniaxial_tension_has_the_tabulated_lateral_stretch_and_stress(name):
     for stretch, (lateral, stress) in zip(STRETCHES, UNIAXIAL[name], strict=True):
-        side, axial = uniaxial(laws[name], stretch, 0.8 * lateral, 1.2 * lateral)
+        side, axial = uniaxial(TABULATED[name], stretch, 0.8 * lateral, 1.2 * lateral)
         assert side == digits(lateral)
         assert axial == digits(stress)
+
+
+@pytest.mark.parametrize("name", ISOTROPIC)
+def test_young_is_the_slope_of_a_tensile_test(name):
+    law, strain = LAWS[name], 1e-6
+    side, axial = uniaxial(law, 1 + strain, 1 - 0.6 * strain, 1.0)
+    assert axial / strain == pytest.approx(1, rel=1e-5)
+    assert (1 - side) / strain == pytest.approx(float(law.poisson_ratio), rel=1e-5)
+
+
+def test_constants_in_pascal_give_stresses_in_pascal():
+    """Treloar (1944), Trans. Faraday Soc. 40: nominal stress in tension; law of Ogden (1972)."""
+    law = fem.OgdenK2([4.095e5, 3e3, 1e4], [1.3, 5.0, -2.0], poisson=0.4999)
+    assert law.mu == pytest.approx(4.225e5)
+    for stretch, stress in ((1.24, 0.23e6), (2.18, 0.58e6), (3.02, 0.85e6), (5.36, 1.94e6)):
+        assert uniaxial(law, stretch, 0.3, 1.0)[1] == pytest.approx(stress, rel=0.15)
+    young = law.young_at_rest
+    assert young == pytest.approx(2 * 4.225e5 * 1.4999)
+    one = law.over(young)
+    for stretch in STRETCHES:
+        over = [young * P for P in principal(one, stretch, 1.1, 0.9)]
+        assert principal(law, stretch, 1.1, 0.9) == pytest.approx(over, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: fem.YeohK2(0.2, 0.0, 0.0), "bulk or poisson must be given.*none is"),
+        (lambda: fem.YeohK2(0.2, 0.0, 0.0, 2.0, 0.3), "the other be null; both are"),
+        (lambda: fem.OgdenK2([1.0], [2.0], poisson=0.5), "poisson = 0.5 must lie between"),
+        (lambda: EnergyAlone(NH).over(2.0), "EnergyAlone are over Young's modulus; set young"),
+        (lambda: fem.VolumetricK2(1.0).young_at_rest, "at rest = 0.0 must be above 0"),
+        (lambda: fem.NeoHookeanLn(fem.CellField([0.3])).young_at_rest, "poisson is a field"),
+    ],
+)
+def test_moduli_without_a_unit_or_a_value_are_an_error(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 @pytest.mark.parametrize(
@@ -258,8 +301,8 @@ def test_uniaxial_tension_follows_the_closed_form(poisson, stretch):
 
 
 @pytest.mark.parametrize("name", BIAXIAL)
-def test_equibiaxial_tension_has_the_tabulated_thickness_and_stress(laws, name):
-    law = laws[name]
+def test_equibiaxial_tension_has_the_tabulated_thickness_and_stress(name):
+    law = TABULATED[name]
     for stretch, (thickness, stress) in zip((0.8, 1.3), BIAXIAL[name], strict=True):
         free = brentq(
             lambda s, stretch=stretch: principal(law, stretch, stretch, s)[2],
@@ -272,23 +315,23 @@ def test_equibiaxial_tension_has_the_tabulated_thickness_and_stress(laws, name):
 
 
 @pytest.mark.parametrize("name", CONFINED)
-def test_confined_stretch_has_the_tabulated_stresses(laws, name):
+def test_confined_stretch_has_the_tabulated_stresses(name):
     for stretch, (P11, P22) in zip((0.6, 1.4), CONFINED[name], strict=True):
-        found = principal(laws[name], stretch, 1.0, 1.0)
+        found = principal(TABULATED[name], stretch, 1.0, 1.0)
         assert found == [digits(P11), digits(P22), digits(P22)]
 
 
 @pytest.mark.parametrize("name", VOLUMETRIC)
-def test_swelling_has_the_tabulated_stress(laws, name):
+def test_swelling_has_the_tabulated_stress(name):
     """The deformation gradient is F = s I."""
     for stretch, stress in zip((0.8, 1.2), VOLUMETRIC[name], strict=True):
-        assert principal(laws[name], *[stretch] * 3) == [digits(stress)] * 3
+        assert principal(TABULATED[name], *[stretch] * 3) == [digits(stress)] * 3
 
 
 @pytest.mark.parametrize("name", SIMPLE_SHEAR)
-def test_simple_shear_has_the_tabulated_stresses(laws, name):
+def test_simple_shear_has_the_tabulated_stresses(name):
     for shear, (P12, P21, P11, P33) in zip((0.5, 1.0), SIMPLE_SHEAR[name], strict=True):
-        P = laws[name].stress(shear * SHEAR).tolist()
+        P = TABULATED[name].stress(shear * SHEAR).tolist()
         assert [P[0][1], P[1][0]] == [digits(P12), digits(P21)]
         assert [P[0][0], P[1][1], P[2][2]] == [digits(P11), digits(P11), digits(P33)]
         assert [P[0][2], P[1][2], P[2][0], P[2][1]] == [pytest.approx(0, abs=1e-15)] * 4
@@ -469,9 +512,9 @@ def test_ogden_with_one_term_of_exponent_two_is_neo_hookean(gradients):
     assert_close(ogden.tangent(gradients), law.tangent(gradients), rtol=1e-9, atol=1e-11)
 
 
-def test_ogden_with_exponents_of_two_is_mooney_rivlin(gradients, laws):
+def test_ogden_with_exponents_of_two_is_mooney_rivlin(gradients):
     """Ib2 - 3 is the sum of lb^-2 - 1: c10 = mu1/2 and c01 = mu2/2 at exponents 2 and -2."""
-    law = laws["mooney_rivlin_k2"]
+    law = TABULATED["mooney_rivlin_k2"]
     ogden = fem.OgdenK2([2 * law.c10, 2 * law.c01], [2.0, -2.0], law.bulk)
     assert_close(ogden.energy(gradients), law.energy(gradients), rtol=1e-11, atol=1e-14)
     assert_close(ogden.stress(gradients), law.stress(gradients), rtol=1e-11, atol=1e-13)
@@ -526,9 +569,9 @@ def test_neo_hookean_is_infinite_at_zero_volume_and_undefined_below():
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_ogden_has_no_stress_where_there_is_no_strain(laws, bad):
+def test_ogden_has_no_stress_where_there_is_no_strain(bad):
     """Its eigenvalues do not exist; the points beside it have theirs."""
-    law, H = laws["ogden_k2"], torch.zeros(3, 3, 3, dtype=torch.float64)
+    law, H = TABULATED["ogden_k2"], torch.zeros(3, 3, 3, dtype=torch.float64)
     H[0, 0, 0], H[1, 2, 1] = 0.1, bad
     for quantity in (law.energy, law.stress, law.tangent):
         found = quantity(H).reshape(3, -1)
@@ -757,9 +800,9 @@ def test_parameters_that_the_law_refuses_are_an_error(ratios):
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-9, 1e-7, 3e-7, 3e-6, 1e-5])
-def test_ogden_is_continuous_where_stretches_meet(laws, gap):
+def test_ogden_is_continuous_where_stretches_meet(gap):
     """The quotient of stresses and its limit give the same tangent on either side of 1e-6."""
-    law = laws["ogden_k2"]
+    law = TABULATED["ogden_k2"]
     axis = torch.tensor([0.3, -0.7, 0.5], dtype=torch.float64)
     turn = torch.matrix_exp(torch.linalg.cross(EYE, axis.expand(3, 3)))
     strains = torch.tensor([0.2, 0.2 + gap, -0.1], dtype=torch.float64)

@@ -10,7 +10,7 @@ import skfem
 from skfem.io.meshio import to_meshio
 
 from dpl import fem
-from dpl.fem.mesh import facets_in, nodes_in
+from dpl.fem.mesh import facets_in, group_names, nodes_in
 
 pytestmark = pytest.mark.usefixtures("in_process")
 
@@ -152,7 +152,8 @@ def test_a_region_that_selects_nothing_is_an_error_that_names_it():
     basis = skfem.Basis(mesh, skfem.ElementHex1())
     for region, name in (
         (fem.Plane(0, 0.3), r"Plane\(axis=0, at=0.3\)"),
-        (fem.Tag("none"), r"Tag\(name='none'\)"),
+        (fem.Tag("none"), "'none'"),
+        ("none", "'none'"),
         (lambda x: np.zeros(len(x), dtype=bool), "lambda"),
     ):
         with pytest.raises(ValueError, match=f"{name}.* holds no node of the mesh"):
@@ -168,9 +169,9 @@ def test_a_region_that_selects_nothing_is_an_error_that_names_it():
 
 def test_the_error_for_an_unknown_tag_lists_the_tags():
     mesh = tagged("quad")
-    with pytest.raises(ValueError, match=r"Tag\(name='ends'\): the mesh has 'end', 'half'$"):
+    with pytest.raises(ValueError, match=r"^'ends' must be a group of the mesh: 'end', 'half'$"):
         nodes_in(fem.Tag("ends"), skfem.Basis(mesh, skfem.ElementQuad1()))
-    with pytest.raises(ValueError, match="the mesh has no tags at all"):
+    with pytest.raises(ValueError, match="'ends' must be a group of the mesh, which has none"):
         facets_in(fem.Tag("ends"), fem.rectangle([1, 1], [2, 2]))
 
 
@@ -267,6 +268,22 @@ def test_physical_groups_of_gmsh_are_tags_by_name_or_by_number(tmp_path):
         "body": [0, 1],
         "far cell": [1],
     }
+
+
+def test_groups_that_gmsh_numbers_are_hidden_unless_there_are_no_others(tmp_path):
+    (tmp_path / "bar.msh").write_text(GMSH_41)
+    mesh = fem.read_mesh(tmp_path / "bar.msh")
+    assert "gmsh:geometrical=1" in mesh.subdomains
+    assert facets_in("held end", mesh).size == 1
+    assert group_names(mesh) == ["7", "body", "far cell", "held end"]
+    with pytest.raises(ValueError, match=r"'lid' must be .*: '7', 'body', 'far cell', 'held end'$"):
+        facets_in("lid", mesh)
+    fem.write_mesh(tmp_path / "bar.vtu", mesh, {})
+    assert set(meshio.read(tmp_path / "bar.vtu").cell_data) == {
+        *("skfem:s:body", "skfem:s:far cell", "skfem:b:held end", "skfem:b:7")
+    }
+    bare = fem.box(*BAR).with_boundaries({"gmsh:geometrical=4": np.array([0])})
+    assert group_names(bare) == ["gmsh:geometrical=4"]
 
 
 def side_blocks(mesh: skfem.Mesh, facets) -> tuple[str, np.ndarray]:

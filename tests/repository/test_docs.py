@@ -15,6 +15,7 @@ from pathlib import Path
 import hydra
 import matplotlib
 import nbformat
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -23,7 +24,9 @@ from PIL import Image
 
 from dpl import config as run
 from dpl.commands import dry_run
+from dpl.fem import read_mesh
 from dpl.fem.linear import BACKENDS
+from dpl.fem.mesh import group_names
 
 ROOT = Path(__file__).parents[2]
 DOCS, CONF, RESULTS = ROOT / "docs", ROOT / "conf", ROOT / "benchmarks" / "results"
@@ -419,7 +422,12 @@ LAUNCHED = {"hydra/launcher=submitit_slurm", "hydra/launcher=submitit_local"}
 
 @pytest.mark.parametrize(
     ("name", "arguments"),
-    [line for line in command_lines("index.md") if line[0] != "compare"],  # has no configuration
+    [
+        line
+        for page in ("index.md", "cad.md")
+        for line in command_lines(page)
+        if line[0] != "compare"  # has no configuration
+    ],
     ids=lambda value: value if isinstance(value, str) else " ".join(value),
 )
 def test_the_commands_of_the_quick_start_are_valid(
@@ -433,6 +441,20 @@ def test_the_commands_of_the_quick_start_are_valid(
     with dry_run.initialized(line):
         single = dry_run.check(line)
     assert (single is None) == ("-m" in plain)  # the configuration of a single job
+
+
+def test_the_script_of_the_page_on_cad_draws_a_quadratic_part_with_named_faces(
+    tmp_path, monkeypatch
+):
+    script = (DOCS / "cad" / "mount.py").read_text()
+    assert script in (DOCS / "cad.md").read_text()
+    pytest.importorskip("gmsh")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(script, "mount.py", "exec"), {})
+    mesh = read_mesh("mount.msh", scale=1e-3)
+    assert group_names(mesh) == ["foot", "rubber", "top"]
+    assert mesh.p.shape[1] > 4 * mesh.nvertices
+    assert np.ptp(mesh.p, axis=1) == pytest.approx([0.024, 0.024, 0.03], rel=1e-3)
 
 
 @pytest.mark.slow  # trains eight runs

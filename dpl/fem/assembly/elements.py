@@ -26,6 +26,9 @@ CURVED = (
     (0.328163263918762614, 0.136218621884634852),
     (0.108046885699134997, 0.113781378115365148),
 )
+QUADRATICALLY = (  # remedy for linear elements
+    "set degree=2 with the same mesh file, or write it with order 2 (Gmsh: Mesh.ElementOrder=2)"
+)
 STRAIGHT = 1e-8  # relative change of the Jacobian in a cell; the quadrature error is its square
 
 
@@ -99,10 +102,10 @@ def locking_warnings(
     lines, shape = [], mesh.elem.refdom.name.lower()
     if poisson >= 0.45 and not mean_dilatation:
         can_project = shape in ("quadrilateral", "hexahedral")
-        remedy = "degree=2 or mean_dilatation=true" if can_project else "degree=2"
-        lines.append(f"linear {shape} elements lock at Poisson's ratio {poisson:.4g}: set {remedy}")
+        remedy = f"{QUADRATICALLY}, or set mean_dilatation=true" if can_project else QUADRATICALLY
+        lines.append(f"linear {shape} elements lock at Poisson's ratio {poisson:.4g}: {remedy}")
     if (aspect := float(aspect_ratio(mesh).max())) > 20:
         lines.append(
-            f"linear {shape} elements of aspect ratio {aspect:.0f} lock in bending: set degree=2"
+            f"linear {shape} elements of aspect ratio {aspect:.0f} lock in bending: {QUADRATICALLY}"
         )
     return lines

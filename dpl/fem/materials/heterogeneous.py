@@ -126,6 +126,11 @@ class Heterogeneous(Composed, Material):
         laws = {name: law.identity() for name, law in self.laws.items()}
         return {"name": type(self).__name__, "laws": laws, "cells": plain(self._layout.law_of_cell)}
 
+    @property
+    def young_at_rest(self) -> float:
+        """Young's modulus at rest of the softest law, see `Material.young_at_rest`."""
+        return min(law.young_at_rest for law in self.laws.values())
+
     def describe(self) -> str:
         return "; ".join(f"{name}: {law.describe()}" for name, law in self.laws.items())
 
@@ -214,7 +219,9 @@ class Layout(NamedTuple):
         numbers: dict[Any, list[int]] = {}
         for k, law in enumerate(laws):
             if (index == k).any():
-                key = type(law) if isinstance(law, InvariantBasedMaterial) else k
+                key: Any = k
+                if isinstance(law, InvariantBasedMaterial):
+                    key = type(law), law.unit, *(getattr(law, name) is None for name in law.ranged)
                 numbers.setdefault(key, []).append(k)
         groups = tuple(
             (own, torch.isin(index, torch.tensor(own)).nonzero()[:, 0]) for own in numbers.values()
@@ -250,7 +257,9 @@ def merge_laws(
     constants: dict[str, Any] = dict(ranges)  # such a law has no moduli yet
     index = torch.searchsorted(torch.tensor(numbers), law_of_cell.clamp(max=numbers[-1]))
     for name in set(laws[0].ranged) - set(ranges):
-        own = [law.value(name) for law in laws]
+        if getattr(laws[0], name) is None:
+            continue
+        own = [law.given(name) for law in laws]
         if not all(value.ndim == 0 and value == own[0] for value in own):
             constants[name] = values_of_cells(own, index)[..., cells, :]
     return replace(cast("Any", laws[0]), **constants)

@@ -1,14 +1,15 @@
 """Laws of the isochoric invariants Ib1 = J^(-2/3) I1 and Ib2 = J^(-4/3) I2 and of the volume."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from dpl.fem.identity import OPTIONAL
 from dpl.fem.materials.arithmetic import exp
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-from dpl.fem.materials.material import check_moduli
+from dpl.fem.materials.material import BulkOrPoisson, check_moduli
 from dpl.fem.materials.parameters import Constant
 from dpl.fem.materials.tensors import green_lagrange, invariants, volume_change
 from dpl.fem.materials.volumetric import k2_derivatives
@@ -77,17 +78,6 @@ class PolynomialMaterial(InvariantBasedMaterial):
         numbers = list(map(float, self.constants))
         check_moduli(self.shear_name, 2 * (numbers[0] + numbers[3]), numbers[4], numbers)
 
-    @property
-    def mu(self) -> Tensor:
-        """Shear modulus at rest over Young's modulus [-]."""
-        c10, _, _, c01, _ = self.constants
-        return 2 * (c10 + c01)
-
-    @property
-    def lam(self) -> Tensor:
-        """First Lame parameter at rest over Young's modulus [-]."""
-        return self.constants[4] - 2 / 3 * self.mu
-
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
         i1, i2, j = isochoric_invariants(H)
@@ -103,7 +93,7 @@ class PolynomialMaterial(InvariantBasedMaterial):
 
 
 @dataclass(frozen=True)
-class MooneyRivlinK2(PolynomialMaterial):
+class MooneyRivlinK2(BulkOrPoisson, PolynomialMaterial):
     """Mooney-Rivlin solid: c10 (Ib1 - 3) + c01 (Ib2 - 3) + bulk/2 (J - 1)^2.
 
     Shear modulus at rest 2 (c10 + c01).
@@ -111,51 +101,67 @@ class MooneyRivlinK2(PolynomialMaterial):
     Source: Rivlin (1948); the volumetric term is that of Abaqus (D1 = 2/bulk).
 
     Attributes:
-        c10, c01, bulk: Moduli over E [-]; numbers, ranges [low, high] or fields.
+        c10, c01, bulk: Moduli in one unit; numbers, ranges [low, high] or fields.
+        poisson: Poisson's ratio at rest [-], in place of `bulk`.
     """
 
-    ranged: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk")
+    ranged: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk", "poisson")
+    dimensional: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk")
     shear_name: ClassVar[str] = "2 (c10 + c01)"
 
     c10: Constant
     c01: Constant
-    bulk: Constant
+    bulk: Constant | None = None
+    poisson: Constant | None = field(default=None, metadata=OPTIONAL)
+
+    @property
+    def mu(self) -> Tensor:
+        """Shear modulus at rest over Young's modulus [-]."""
+        return 2 * (self.value("c10") + self.value("c01"))
 
     @property
     def constants(self) -> tuple[Tensor, ...]:
         """Return c10, 0, 0, c01 and bulk."""
-        c10, c01, bulk = super().constants
-        return c10, 0 * c10, 0 * c10, c01, bulk
+        c10, c01 = self.value("c10"), self.value("c01")
+        return c10, 0 * c10, 0 * c10, c01, self.bulk_modulus
 
 
 @dataclass(frozen=True)
-class YeohK2(PolynomialMaterial):
+class YeohK2(BulkOrPoisson, PolynomialMaterial):
     """Yeoh's solid: c10 (Ib1 - 3) + c20 (Ib1 - 3)^2 + c30 (Ib1 - 3)^3 + bulk/2 (J - 1)^2.
 
     Source: Yeoh (1993), Rubber Chem. Technol. 66; the volumetric term is that of Abaqus.
 
     Attributes:
-        c10, c20, c30, bulk: Moduli over E [-]; numbers, ranges [low, high] or fields. The shear
+        c10, c20, c30, bulk: Moduli in one unit; numbers, ranges [low, high] or fields. The shear
             modulus at rest is 2 c10.
+        poisson: Poisson's ratio at rest [-], in place of `bulk`.
     """
 
-    ranged: ClassVar[tuple[str, ...]] = ("c10", "c20", "c30", "bulk")
+    ranged: ClassVar[tuple[str, ...]] = ("c10", "c20", "c30", "bulk", "poisson")
+    dimensional: ClassVar[tuple[str, ...]] = ("c10", "c20", "c30", "bulk")
     shear_name: ClassVar[str] = "2 c10"
 
     c10: Constant
     c20: Constant
     c30: Constant
-    bulk: Constant
+    bulk: Constant | None = None
+    poisson: Constant | None = field(default=None, metadata=OPTIONAL)
+
+    @property
+    def mu(self) -> Tensor:
+        """Shear modulus at rest over Young's modulus [-]."""
+        return 2 * self.value("c10")
 
     @property
     def constants(self) -> tuple[Tensor, ...]:
         """Return c10, c20, c30, 0 and bulk."""
-        c10, c20, c30, bulk = super().constants
-        return c10, c20, c30, 0 * c10, bulk
+        c10, c20, c30 = map(self.value, self.dimensional[:3])
+        return c10, c20, c30, 0 * c10, self.bulk_modulus
 
 
 @dataclass(frozen=True)
-class DemirayK2(InvariantBasedMaterial):
+class DemirayK2(BulkOrPoisson, InvariantBasedMaterial):
     """Demiray's solid: a/(2 b) (exp(b (Ib1 - 3)) - 1) + bulk/2 (J - 1)^2.
 
     Shear modulus at rest a. It is the isotropic part of `HolzapfelOgdenFibres`.
@@ -164,20 +170,25 @@ class DemirayK2(InvariantBasedMaterial):
     Soc. A 367. The volumetric term is that of Abaqus.
 
     Attributes:
-        a: Shear modulus over E [-].
+        a: Shear modulus, in the unit of `bulk`.
         b: Exponent [-].
-        bulk: Bulk modulus over E [-].
+        bulk: Bulk modulus.
+        poisson: Poisson's ratio at rest [-], in place of `bulk`.
     """
 
-    ranged: ClassVar[tuple[str, ...]] = ("a", "b", "bulk")
+    ranged: ClassVar[tuple[str, ...]] = ("a", "b", "bulk", "poisson")
+    dimensional: ClassVar[tuple[str, ...]] = ("a", "bulk")
 
     a: Constant
     b: Constant
-    bulk: Constant
+    bulk: Constant | None = None
+    poisson: Constant | None = field(default=None, metadata=OPTIONAL)
 
     def check_constants(self) -> None:
         """Check that the body resists shear and compression, and the exponent."""
-        check_moduli("a", self.a, self.bulk, (self.a, self.b, self.bulk))
+        super().check_constants()
+        bulk = float(self.bulk_modulus)
+        check_moduli("a", self.a, bulk, (self.a, self.b, bulk))
         if not self.b > 0:
             raise ValueError(f"b = {self.b} must be above 0")
 
@@ -190,18 +201,12 @@ class DemirayK2(InvariantBasedMaterial):
     @property
     def constants(self) -> tuple[Tensor, ...]:
         """Return a/2, b and bulk."""
-        a, b, bulk = super().constants
-        return a / 2, b, bulk
+        return self.value("a") / 2, self.value("b"), self.bulk_modulus
 
     @property
     def mu(self) -> Tensor:
         """Shear modulus at rest over Young's modulus [-]."""
         return self.value("a")
-
-    @property
-    def lam(self) -> Tensor:
-        """First Lame parameter at rest over Young's modulus [-]."""
-        return self.value("bulk") - 2 / 3 * self.mu
 
     @staticmethod
     def invariant_derivatives(

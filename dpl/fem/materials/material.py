@@ -6,16 +6,16 @@ its stress as a difference of terms that cancel at rest.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from itertools import product
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from dpl.fem.identity import identity_of
-from dpl.fem.materials.parameters import Constant, Parametrised
+from dpl.fem.materials.parameters import CellField, Constant, Parametrised, Scalable
 from dpl.fem.materials.tensors import green_lagrange, trace, with_axes
 
 
@@ -155,7 +155,7 @@ class Material(Parametrised):
         for name, value in values.items():
             if isinstance(value, Tensor):
                 words.append(f"{name} from {value.min():.4g} to {value.max():.4g}")
-            elif not (name == "young" and value == 1):
+            elif value is not None and (name, value) != ("young", 1) and name != "unit":
                 words.append(f"{name}={value!r}")
         return f"{type(self).__name__}({', '.join(words)})"
 
@@ -196,9 +196,55 @@ class Material(Parametrised):
     @property
     def largest_poisson_ratio(self) -> float:
         """Largest Poisson's ratio at rest of all cells and parameters [-]."""
-        ends = list(product(*self.parameter_ranges.values()))
-        laws = [self.with_parameters(torch.tensor([end], dtype=torch.float64)) for end in ends]
-        return max(float(law.poisson_ratio.max()) for law in laws)
+        return max(float(law.poisson_ratio.max()) for law in self._at_ends)
+
+    @property
+    def _at_ends(self) -> list[Self]:
+        """The law at each combination of the ends of its ranges."""
+        ends = product(*self.parameter_ranges.values())
+        return [self.with_parameters(torch.tensor([end], dtype=torch.float64)) for end in ends]
+
+    @property
+    def young_at_rest(self) -> float:
+        """Young's modulus at rest, see `Scalable`; over E, or in the unit of the moduli.
+
+        With fibres it is that of the average over all directions, see `FibreReinforced.mu`.
+
+        Raises:
+            ValueError: A modulus is a field, or there is no stiffness at rest.
+        """
+        middles = [[ends.middle for ends in self.parameter_ranges.values()]]
+        law = self.with_parameters(torch.tensor(middles, dtype=torch.float64))
+        young = float(law._moduli_at_rest[0].mean())
+        if not 0 < young < math.inf:
+            raise ValueError(f"Young's modulus at rest = {young} must be above 0")
+        return young
+
+    def normalised(self) -> Self:
+        """Return the law with E at rest = 1; itself if its moduli are over E by definition."""
+        return self
+
+    @property
+    def _moduli_at_rest(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """E, mu, K and nu at rest."""
+        mu, lam = torch.broadcast_tensors(self.mu, self.lam)
+        return mu * (3 * lam + 2 * mu) / (lam + mu), mu, lam + 2 / 3 * mu, self.poisson_ratio
+
+    def describe_rest(self, young: Sequence[float]) -> str:
+        """Return E, mu, K and nu at rest in words, or their least and largest values.
+
+        Args:
+            young: Least and largest Young's modulus of the scene [Pa].
+        """
+        words, unit = [], " Pa"
+        columns = zip(*(law._moduli_at_rest for law in self._at_ends), strict=True)
+        for name, values in zip(("E", "mu", "K", "nu"), columns, strict=True):
+            ends = min(float(v.min()) for v in values), max(float(v.max()) for v in values)
+            if name == "nu":
+                young, unit = (1.0, 1.0), ""
+            low, high = (f"{end * scale:.4g}" for end, scale in zip(ends, young, strict=True))
+            words.append(f"{name} {f'= {low}' if low == high else f'from {low} to {high}'}{unit}")
+        return ", ".join(words)
 
     def groups(self, count: int) -> "list[tuple[Material, Tensor]]":
         """Return laws of one class and the numbers of the cells of each, of a body of E cells."""
@@ -206,7 +252,7 @@ class Material(Parametrised):
 
 
 @dataclass(frozen=True)
-class YoungPoissonMaterial(Material):
+class YoungPoissonMaterial(Material, Scalable):
     """Law that at rest is Hooke's: such laws can be swapped fairly.
 
     Attributes:
@@ -217,6 +263,7 @@ class YoungPoissonMaterial(Material):
     """
 
     ranged: ClassVar[tuple[str, ...]] = ("poisson", "young")
+    dimensional: ClassVar[tuple[str, ...]] = ("young",)
 
     poisson: Constant
     young: Constant = 1.0
@@ -232,7 +279,8 @@ class YoungPoissonMaterial(Material):
 
     def identity(self) -> dict[str, Any]:
         """Return class name and parameters; `young` is left out if it is that of the scene."""
-        exclude = ["young"] if isinstance(self.young, int | float) and self.young == 1 else []
+        is_scene = isinstance(self.young, int | float) and self.young * self.unit == 1
+        exclude = ["young", "unit"] if is_scene else []
         return identity_of(self, exclude=exclude)
 
     @property
@@ -252,6 +300,49 @@ class YoungPoissonMaterial(Material):
         return self.lam + 2 / 3 * self.mu
 
 
+class BulkOrPoisson(Material, Scalable):
+    """Law with the volumetric term bulk/2 (J - 1)^2 and a shear modulus at rest `mu`.
+
+    In place of `bulk`, Poisson's ratio at rest may be given: K = 2 mu (1 + nu) / (3 (1 - 2 nu)).
+    """
+
+    bulk: Constant | None
+    poisson: Constant | None
+
+    def __post_init__(self) -> None:
+        if (self.bulk is None) == (self.poisson is None):
+            given = "both are" if self.poisson is not None else "none is"
+            raise ValueError(f"bulk or poisson must be given, and the other be null; {given}")
+        super().__post_init__()
+
+    def check_constants(self) -> None:
+        """Check Poisson's ratio."""
+        if self.poisson is not None and not -1.0 < self.poisson < 0.5:
+            raise ValueError(
+                f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)"
+            )
+        super().check_constants()
+
+    @property
+    def bulk_modulus(self) -> Tensor:
+        """Bulk modulus over Young's modulus [-]."""
+        if self.bulk is not None:
+            return self.value("bulk")
+        nu = self.value("poisson")
+        return self.mu * (2 * (1 + nu) / (3 * (1 - 2 * nu)))
+
+    @property
+    def lam(self) -> Tensor:
+        """First Lame parameter at rest over Young's modulus [-]."""
+        return self.bulk_modulus - 2 / 3 * self.mu
+
+    def normalised(self) -> Self:
+        """Return the law with E at rest = 1; itself if a constant is a field, which is over E."""
+        if any(isinstance(getattr(self, name), CellField) for name in self.ranged):
+            return self
+        return self.over(self.young_at_rest)
+
+
 def vector_of(*moduli: Tensor) -> Tensor:
     """Return moduli, each of all cells, as one vector (1, M) or (B, M)."""
     columns = torch.broadcast_tensors(*moduli, torch.zeros(1, 1, 1))[:-1]
@@ -268,6 +359,6 @@ def check_moduli(name: str, shear: float, bulk: float, constants: Iterable[float
     if not 0 < shear < math.inf:
         raise ValueError(f"{name} = {shear} must be above 0: it is the shear modulus at rest")
     if not 0 < bulk < math.inf:
-        raise ValueError(f"bulk = {bulk} must be above 0")
+        raise ValueError(f"bulk = {bulk:g} must be above 0")
     if not all(math.isfinite(constant) for constant in constants):
         raise ValueError(f"moduli = {list(constants)} must be finite numbers")

@@ -1,18 +1,19 @@
 """Ogden's law, in principal stretches."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.material import Material, Response, check_moduli
+from dpl.fem.identity import OPTIONAL
+from dpl.fem.materials.material import BulkOrPoisson, Response, check_moduli
 from dpl.fem.materials.tensors import green_lagrange, volume_change
 
 
 @dataclass(frozen=True)
-class OgdenK2(Material):
+class OgdenK2(BulkOrPoisson):
     """Ogden's solid: sum 2 mu_i/alpha_i^2 (lb1^alpha_i + lb2^alpha_i + lb3^alpha_i - 3)
     + bulk/2 (J - 1)^2, lb = J^(-1/3) lambda the isochoric principal stretches.
 
@@ -22,14 +23,18 @@ class OgdenK2(Material):
     Source: Ogden (1972), Proc. R. Soc. A 326; moduli by Simo, Taylor (1991), CMAME 85, section 2.
 
     Attributes:
-        shear: mu_i over E [-].
+        shear: mu_i, in the unit of `bulk`.
         exponents: alpha_i [-], as many.
-        bulk: Over E [-].
+        bulk: Bulk modulus.
+        poisson: Poisson's ratio at rest [-], in place of `bulk`.
     """
+
+    dimensional: ClassVar[tuple[str, ...]] = ("shear", "bulk")
 
     shear: Sequence[float]
     exponents: Sequence[float]
-    bulk: float
+    bulk: float | None = None
+    poisson: float | None = field(default=None, metadata=OPTIONAL)
 
     def check_constants(self) -> None:
         """Check that there are as many exponents as moduli, none 0, and that the body resists."""
@@ -37,19 +42,28 @@ class OgdenK2(Material):
             raise ValueError(
                 f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"
             )
-        constants = [*self.shear, *self.exponents, self.bulk]
-        check_moduli("sum of shear", sum(self.shear), self.bulk, constants)
+        super().check_constants()
+        bulk = float(self.bulk_modulus)
+        constants = [*self.shear, *self.exponents, bulk]
+        check_moduli("sum of shear", sum(self.shear), bulk, constants)
+
+    @property
+    def mu(self) -> Tensor:
+        """Shear modulus at rest over Young's modulus [-]."""
+        return torch.tensor(sum(self.shear) * self.unit, dtype=torch.float64)
+
+    @property
+    def _terms(self) -> list[tuple[float, float]]:
+        """mu_i over Young's modulus and alpha_i [-]."""
+        return [(mu * self.unit, a) for mu, a in zip(self.shear, self.exponents, strict=True)]
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
         j = volume_change(H)
         logs = torch.log1p(2 * _spectrum(green_lagrange(H))[0]) / 2
         logs = logs - torch.log1p(j)[..., None] / 3
-        terms = [
-            2 * mu / a**2 * torch.expm1(a * logs).sum(-1)
-            for mu, a in zip(self.shear, self.exponents, strict=True)
-        ]
-        return sum(terms) + self.bulk / 2 * j.square()
+        terms = [2 * mu / a**2 * torch.expm1(a * logs).sum(-1) for mu, a in self._terms]
+        return sum(terms) + self.bulk_modulus / 2 * j.square()
 
     def stress(self, H: Tensor) -> Tensor:
         """Return the first Piola-Kirchhoff stress, see `Material.stress`; NaN where inverted."""
@@ -81,9 +95,10 @@ class OgdenK2(Material):
         log_J = logs.sum(-1, keepdim=True)
         j = torch.expm1(log_J)
         eye = torch.eye(3, dtype=strain.dtype, device=strain.device)
-        T = self.bulk * (1 + j) * j + torch.zeros_like(logs)
-        dT = (self.bulk * (1 + j) * (1 + 2 * j))[..., None] + torch.zeros_like(eye)
-        for mu, a in zip(self.shear, self.exponents, strict=True):
+        bulk = self.bulk_modulus
+        T = bulk * (1 + j) * j + torch.zeros_like(logs)
+        dT = (bulk * (1 + j) * (1 + 2 * j))[..., None] + torch.zeros_like(eye)
+        for mu, a in self._terms:
             grown = torch.expm1(a * (logs - log_J / 3))  # lb^a - 1
             mean = grown.mean(-1, keepdim=True)
             T = T + 2 * mu / a * (grown - mean)

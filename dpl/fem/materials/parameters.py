@@ -1,7 +1,7 @@
 """Constants of laws: numbers, ranges, or fields with a value for each cell."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dpl.fem.identity import OPTIONAL
 from dpl.fem.mesh.regions import Origin
 from dpl.fem.ranges import ParameterRange, is_range
 from dpl.system.checks import named_errors
@@ -80,9 +81,13 @@ class Parametrised:
 
     Attributes:
         ranged: Names of the constants that may be ranges [low, high] or fields.
+        dimensional: Names of those that are moduli, in one unit, see `Scalable`.
+        unit: This unit over Young's modulus of the scene [-].
     """
 
     ranged: ClassVar[tuple[str, ...]] = ()
+    dimensional: ClassVar[tuple[str, ...]] = ()
+    unit: float = 1.0
 
     def __post_init__(self) -> None:
         for name in self.ranged:
@@ -111,12 +116,19 @@ class Parametrised:
         """
 
     def value(self, name: str) -> Tensor:
-        """Return a constant in float64, see the class.
+        """Return a constant in float64, see the class; moduli over Young's modulus of the scene.
 
         Raises:
-            ValueError: It is a range.
+            ValueError: It is a range, or a field whose values are not known before `on`.
         """
+        value = self.given(name)
+        return value * self.unit if name in self.dimensional else value
+
+    def given(self, name: str) -> Tensor:
+        """Return a constant in float64 in the unit in which it is given, see `value`."""
         value = getattr(self, name)
+        if isinstance(value, CellField):
+            raise ValueError(f"{name} is a field; its values are known on a body only")
         if isinstance(value, ParameterRange):
             raise ValueError(
                 f"{name} = {list(value)} is a range; choose a value with "
@@ -139,6 +151,12 @@ class Parametrised:
         """
         values = {name: getattr(self, name) for name in self.ranged}
         return {name: v for name, v in values.items() if isinstance(v, ParameterRange)}
+
+    @property
+    def units_of_ranges(self) -> dict[str, float | None]:
+        """Unit of each range over E [-], by name; None for a number without unit."""
+        names = self.parameter_ranges
+        return {name: self.unit if name in self.dimensional else None for name in names}
 
     @property
     def rest_moduli(self) -> Tensor:
@@ -168,6 +186,16 @@ class Parametrised:
                 with named_errors(f"{name}: "):
                     made[name] = value.on(basis, length, origin)
         return replace(cast("Any", self), **made) if made else self
+
+    def over(self, modulus: float) -> Self:
+        """Return the law with its moduli divided by a modulus in their unit, see `Scalable`.
+
+        Raises:
+            ValueError: The moduli of the law have no unit: they are over E.
+        """
+        raise ValueError(
+            f"the moduli of {type(self).__name__} are over Young's modulus; set young [Pa]"
+        )
 
     def of_cells(self, cells: Tensor) -> Self:
         """Return the law of some cells (C,) of the body."""
@@ -206,6 +234,35 @@ class Parametrised:
         return replace(cast("Any", self), **dict(zip(names, values, strict=True)))
 
 
+@dataclass(frozen=True)
+class Scalable(Parametrised):
+    """Law whose moduli are given in one unit of any size, such as Pa.
+
+    Inside `dpl.fem` all moduli are over Young's modulus E of the scene. The constants, ranges and
+    parameters of a law remain as they are given; `value` multiplies those in `dimensional` by
+    `unit`. `over` sets this factor from the modulus of the law itself:
+
+        law = YeohK2(c10=0.11e6, c20=0.02e6, c30=0.0, poisson=0.45)     # [Pa]
+        young = law.young_at_rest                                       # [Pa]
+        problem = Problem.build(mesh, law.over(young), young=young)
+
+    E at rest follows from the linearised law, E = mu (3 lambda + 2 mu) / (lambda + mu) with mu and
+    lambda at zero strain. A constant with a range has the middle of the range there.
+
+    Source: Holzapfel (2000), Nonlinear Solid Mechanics, section 6.5, for the shear moduli at rest
+    of laws of rubber; Landau, Lifshitz (1986), Theory of Elasticity, section 5, for E, K and nu.
+
+    Attributes:
+        unit: Unit of the moduli over E [-].
+    """
+
+    unit: float = field(default=1.0, kw_only=True, metadata=OPTIONAL)
+
+    def over(self, modulus: float) -> Self:
+        """Return the law with its moduli divided by a modulus in their unit."""
+        return replace(self, unit=self.unit / modulus)
+
+
 class Composed(Parametrised):
     """Law of several parts, whose parameters have the name of the part before their own."""
 
@@ -225,6 +282,12 @@ class Composed(Parametrised):
         return {f"{key}.{name}": ends for key, ranges in pairs for name, ends in ranges}
 
     @property
+    def units_of_ranges(self) -> dict[str, float | None]:
+        """Units of the ranges of the parts, see `Parametrised.units_of_ranges`."""
+        pairs = [(key, part.units_of_ranges.items()) for key, part in self.parts.items()]
+        return {f"{key}.{name}": unit for key, units in pairs for name, unit in units}
+
+    @property
     def rest_moduli(self) -> Tensor:
         """Moduli at rest of the parts, one after the other, (1, M) or (B, M) [-]."""
         parts = [part.rest_moduli for part in self.parts.values()]
@@ -238,6 +301,10 @@ class Composed(Parametrised):
             with named_errors(f"{key}."):
                 parts[key] = part.on(basis, length, origin)
         return self._changed(parts)
+
+    def over(self, modulus: float) -> Self:
+        """Return the law with the moduli of all parts divided by one, see `Scalable.over`."""
+        return self.with_parts({key: part.over(modulus) for key, part in self.parts.items()})
 
     def of_cells(self, cells: Tensor) -> Self:
         """Return the law of some cells (C,) of the body."""

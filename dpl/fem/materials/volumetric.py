@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-from dpl.fem.materials.parameters import Constant
+from dpl.fem.materials.parameters import Constant, Scalable
 from dpl.fem.materials.tensors import volume_change
 
 
@@ -23,7 +23,7 @@ def k4_derivatives(bulk: Any, j: Any) -> tuple[Any, Any]:
 
 
 @dataclass(frozen=True)
-class VolumetricK2(InvariantBasedMaterial):
+class VolumetricK2(InvariantBasedMaterial, Scalable):
     """Volumetric energy bulk/2 (J - 1)^2.
 
     It does not resist shear, so that it is no law of a body without the fibres of
@@ -32,10 +32,11 @@ class VolumetricK2(InvariantBasedMaterial):
     Source: The volumetric term of Abaqus (D1 = 2/bulk).
 
     Attributes:
-        bulk: Bulk modulus over E [-].
+        bulk: Bulk modulus, see `Scalable`.
     """
 
     ranged: ClassVar[tuple[str, ...]] = ("bulk",)
+    dimensional: ClassVar[tuple[str, ...]] = ("bulk",)
 
     bulk: Constant
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         Tag,
         cells_in,
         facets_in,
+        group_names,
         nodes_in,
     )
     from dpl.fem.mesh.validation import check_mesh

@@ -1,5 +1,6 @@
 """Read mesh files, with their named sets of cells and facets."""
 
+import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,14 +31,14 @@ Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
 
 
-def read_mesh(path: str | Path) -> skfem.Mesh:
+def read_mesh(path: str | Path, scale: float = 1.0) -> skfem.Mesh:
     """Return the mesh of a file, validated by `check_mesh`.
 
     The cells of the highest dimension are kept in their order, those of inverted node order are
     reordered, nodes without a cell are dropped, and a mesh of constant z becomes a 2D mesh.
 
-    Named parts become scikit-fem's `mesh.boundaries` (facets) and `mesh.subdomains` (cells), which
-    `dpl.fem.Tag` selects:
+    Named parts become scikit-fem's `mesh.boundaries` (facets) and `mesh.subdomains` (cells), whose
+    names are regions, see `dpl.fem.Tag`:
 
     - physical groups of Gmsh, by name, or by number ("7") if they have no name;
     - sets of cells or nodes (.inp and others), by name;
@@ -49,7 +50,8 @@ def read_mesh(path: str | Path) -> skfem.Mesh:
 
     Args:
         path: A file in a format of meshio that needs no further files (.msh, .vtu, .vtk, .inp,
-            ...), coordinates in metres. The file need not be trusted, see `dpl.fem.mesh.sandbox`.
+            ...). The file need not be trusted, see `dpl.fem.mesh.sandbox`.
+        scale: Unit of its coordinates [m]: 1e-3 for millimetres.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -61,6 +63,8 @@ def read_mesh(path: str | Path) -> skfem.Mesh:
         UserWarning: Nodes are dropped, or the node order of cells is inverted.
     """
     path = Path(path)
+    if not 0 < scale < math.inf:
+        raise ValueError(f"scale = {scale} must be a number above 0, the unit of the file [m]")
     raw = read(path)
     try:
         mesh, repairs = to_mesh(raw)
@@ -68,7 +72,7 @@ def read_mesh(path: str | Path) -> skfem.Mesh:
         raise ValueError(f"{path}: {error}") from None
     if repairs:
         warnings.warn(f"{path}: {'; '.join(repairs)}", stacklevel=2)
-    return mesh
+    return mesh if scale == 1 else mesh.scaled(scale)
 
 
 def read_cell_data(path: str | Path, names: Sequence[str]) -> list[Array]:

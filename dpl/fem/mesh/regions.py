@@ -1,7 +1,8 @@
 """Regions of a body, which select nodes and facets for boundary conditions and loads.
 
-A region is a function that maps points (N, D) [m] to a mask (N,), or a `Tag`, the name of a part of
-the mesh. `nodes_in`, `facets_in` and `cells_in` take both.
+A region is a function that maps points (N, D) [m] to a mask (N,), or the name of a group of the
+mesh: a `Tag`, or a string, which means the `Tag` of that name. `nodes_in`, `facets_in` and
+`cells_in` are the only functions that evaluate regions, and take all of them.
 """
 
 import math
@@ -138,14 +139,30 @@ class Tag:
             return np.asarray(facets[self.name])
         if self.name in cells:
             return None
-        named_first = sorted({*facets, *cells}, key=lambda name: ("=" in name, name))
-        names = list(map(repr, named_first))
+        names = list(map(repr, group_names(mesh)))
         more = f" and {len(names) - 20} more" if len(names) > 20 else ""
-        raise ValueError(f"{self}: the mesh has {', '.join(names[:20]) or 'no tags at all'}{more}")
+        known = f": {', '.join(names[:20])}{more}" if names else ", which has none"
+        raise ValueError(f"{self.name!r} must be a group of the mesh{known}")
+
+
+def group_names(mesh: skfem.Mesh) -> list[str]:
+    """Return the names of the groups of a mesh, those of the user before values of fields.
+
+    Groups that Gmsh numbers itself (`gmsh:geometrical=4`) are left out if there are others.
+    """
+    names = sorted({*(mesh.boundaries or {}), *(mesh.subdomains or {})})
+    names.sort(key=lambda name: "=" in name)
+    return [name for name in names if not name.startswith("gmsh:")] or names
 
 
 Origin = NDArray[np.float64] | float
-Region = Callable[[NDArray[np.float64]], NDArray[np.bool_]] | Tag
+Points = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
+Region = Points | Tag | str
+
+
+def _resolved(region: Region) -> Points | Tag:
+    """Return a region; a string is the name of a `Tag`."""
+    return Tag(region) if isinstance(region, str) else region
 
 
 def nodes_in(
@@ -154,16 +171,17 @@ def nodes_in(
     """Return a mask of the nodes in a region, (N,).
 
     Args:
-        region: The region. A `Tag` contains the nodes of its facets or cells.
+        region: The region. A group contains the nodes of its facets or cells.
         basis: scikit-fem basis of one displacement component; its N nodes include those of edges,
             faces and cells.
         scale: Length unit of the mesh of the basis [m].
         origin: Origin of that mesh in its own unit, (D,).
 
     Raises:
-        ValueError: The region contains no node, the tag does not exist, or the region does not
+        ValueError: The region contains no node, the group does not exist, or the region does not
             return a mask (N,).
     """
+    region = _resolved(region)
     if isinstance(region, Tag):
         inside = np.zeros(basis.N, dtype=bool)
         facets = region.facets(basis.mesh)
@@ -184,17 +202,17 @@ def facets_in(
     """Return the boundary facets in a region in ascending order.
 
     Args:
-        region: The region. It contains the facets whose vertices all lie inside. A `Tag` contains
+        region: The region. It contains the facets whose vertices all lie inside. A group contains
             its facets, or those whose vertices all belong to its cells.
         mesh: The body.
         scale: Length unit of the mesh [m].
         origin: Origin of the mesh in its own unit, (D,).
 
     Raises:
-        ValueError: The region contains no boundary facet, the tag does not exist, or the region
+        ValueError: The region contains no boundary facet, the group does not exist, or the region
             does not return a mask (N,).
     """
-    boundary = mesh.boundary_facets()
+    region, boundary = _resolved(region), mesh.boundary_facets()
     if not isinstance(region, Tag):
         inside = _inside(region, (mesh.p.T + origin) * scale)[mesh.facets[:, boundary]].all(axis=0)
     elif (tagged := region.facets(mesh)) is not None:
@@ -215,19 +233,20 @@ def cells_in(
 
     Args:
         region: The region. It contains the cells whose centres, the means of the vertices, lie
-            inside. A `Tag` contains its cells.
+            inside. A group contains its cells.
         mesh: The body.
         scale: Length unit of the mesh [m].
         origin: Origin of the mesh in its own unit, (D,).
 
     Raises:
-        ValueError: The region contains no cell, the tag does not exist or is one of facets, or the
-            region does not return a mask (N,).
+        ValueError: The region contains no cell, the group does not exist or is one of facets, or
+            the region does not return a mask (N,).
     """
+    region = _resolved(region)
     if isinstance(region, Tag):
         if region.name not in (mesh.subdomains or {}):
             region.facets(mesh)  # raises if the mesh has no such name
-            raise ValueError(f"{region} names facets and must name cells")
+            raise ValueError(f"{_name(region)} names facets and must name cells")
         cells = np.sort(np.asarray(mesh.subdomains[region.name]))
     else:
         centres = mesh.p[:, mesh.t].mean(axis=1).T
@@ -237,7 +256,7 @@ def cells_in(
     return cells
 
 
-def _inside(region: Callable, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _inside(region: Points, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     inside = np.asarray(region(np.ascontiguousarray(points)))
     if inside.dtype != bool or inside.shape != (len(points),):
         raise ValueError(
@@ -247,8 +266,8 @@ def _inside(region: Callable, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     return inside
 
 
-def _name(region: Region) -> str:
-    return getattr(region, "__name__", None) or repr(region)
+def _name(region: Points | Tag) -> str:
+    return getattr(region, "__name__", None) or repr(getattr(region, "name", region))
 
 
 def _in_ball(

@@ -13,6 +13,8 @@ from meshio.xdmf import TimeSeriesWriter
 from numpy.typing import NDArray
 from skfem.io.meshio import to_meshio
 
+from dpl.fem.mesh.regions import group_names
+
 MIRRORED = [1, 0, 2, 3, 4, 6, 5, 8, 7, 9]  # exchange of the first two corners of a tetrahedron
 Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
@@ -50,13 +52,17 @@ def _left_handed(mesh: skfem.Mesh) -> NDArray[np.bool_]:
 
 
 def _tags(mesh: skfem.Mesh) -> dict[str, list[Array]]:
-    """Return the tags of a body as cell data, facets numbered as by `flat_cells`.
+    """Return the groups of a body as cell data, facets numbered as by `flat_cells`.
 
+    Only `group_names` are written.
     A set of facets is stored as one bit per facet of each cell. An exchange of the first two
     corners of a tetrahedron exchanges its last two facets.
     """
-    tags: dict[str, list[Array]] = to_meshio(mesh).cell_data
-    for name, (bits,) in tags.items():
+    shown, tags = group_names(mesh), {}
+    for name, (bits,) in to_meshio(mesh).cell_data.items():
+        if name.partition(":")[2].partition(":")[2] not in shown:
+            continue
+        tags[name] = [bits]
         if name.startswith("skfem:b:"):
             whole = np.asarray(bits).astype(np.int64)
             change = (whole >> 3 ^ whole >> 2) & _left_handed(mesh)

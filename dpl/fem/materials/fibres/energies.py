@@ -15,7 +15,7 @@ from torch import Tensor
 from dpl.fem.materials.arithmetic import exp, positive_part, step
 from dpl.fem.materials.linear_elastic import linear_law
 from dpl.fem.materials.material import vector_of
-from dpl.fem.materials.parameters import Constant, Parametrised
+from dpl.fem.materials.parameters import Constant, Parametrised, Scalable
 
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))  # rows and columns, in their order
 
@@ -64,7 +64,7 @@ class FibreEnergy(Parametrised):
 
 
 @dataclass(frozen=True)
-class Guccione(FibreEnergy):
+class Guccione(FibreEnergy, Scalable):
     """Fung-type energy c/2 (exp(Q) - 1), transversely isotropic.
 
     Q = bf E11^2 + bt (E22^2 + E33^2 + 2 E23^2) + 2 bfs (E12^2 + E13^2).
@@ -79,6 +79,7 @@ class Guccione(FibreEnergy):
     """
 
     ranged: ClassVar[tuple[str, ...]] = ("c", "bf", "bt", "bfs")
+    dimensional: ClassVar[tuple[str, ...]] = ("c",)
 
     c: Constant
     bf: Constant
@@ -115,7 +116,7 @@ class Guccione(FibreEnergy):
 
 
 @dataclass(frozen=True)
-class HolzapfelGasserOgdenFibres(FibreEnergy):
+class HolzapfelGasserOgdenFibres(FibreEnergy, Scalable):
     """Families of dispersed fibres: sum of k1/(2 k2) (exp(k2 <E_i>^2) - 1) over the families.
 
     E_i = kappa (I1 - 3) + (1 - 3 kappa) (I4_i - 1), I4_i = C : (a_i x a_i), <x> = max(x, 0): a
@@ -133,6 +134,7 @@ class HolzapfelGasserOgdenFibres(FibreEnergy):
     """
 
     ranged: ClassVar[tuple[str, ...]] = ("k1", "k2", "kappa")
+    dimensional: ClassVar[tuple[str, ...]] = ("k1",)
 
     k1: Constant
     k2: Constant
@@ -188,7 +190,7 @@ class HolzapfelGasserOgdenFibres(FibreEnergy):
 
 
 @dataclass(frozen=True)
-class HolzapfelOgdenFibres(FibreEnergy):
+class HolzapfelOgdenFibres(FibreEnergy, Scalable):
     """Fibres and sheets of the myocardium.
 
     W = af/(2 bf) (exp(bf <I4f - 1>^2) - 1) + as/(2 bs) (exp(bs <I4s - 1>^2) - 1)
@@ -204,6 +206,7 @@ class HolzapfelOgdenFibres(FibreEnergy):
     """
 
     ranged: ClassVar[tuple[str, ...]] = ("af", "bf", "as_", "bs", "afs", "bfs")
+    dimensional: ClassVar[tuple[str, ...]] = ("af", "as_", "afs")
 
     af: Constant
     bf: Constant
