@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.paper_tables import ON_LINEAR
+from benchmarks.paper_tables import PLAIN
 from benchmarks.study import picture
 from dpl.evaluation.tables import write
 from dpl.visualization import method_colours
@@ -93,7 +93,7 @@ def draw(curves: Mapping[str, Sequence[Validation]], path: Path) -> None:
             epochs, errors = zip(
                 *((point.epoch, point.rel_L2_median) for point in line), strict=True
             )
-            colour, dashes = colours[families[name]], "-" if ON_LINEAR in name else "--"
+            colour, dashes = colours[families[name]], "--" if PLAIN in name else "-"
             ax.plot(epochs, errors, marker="o", ms=3, lw=1.2, color=colour, ls=dashes)
             ax.annotate(
                 name, (epochs[-1], errors[-1]), xytext=(5, 0), textcoords="offset points",
