@@ -184,7 +184,14 @@ def test_a_mesh_from_a_file_of_another_program_is_trained_on(script, tmp_path):
     flipped = np.linalg.det(edges) < 0
     cells[flipped] = cells[flipped][:, [0, 2, 1, 3]]
     meshio.write(tmp_path / "part.msh", meshio.Mesh(points[shuffled], [("tetra", cells)]), "gmsh22")
-    sizes = ["data.train=6", "data.val=2", "data.test=2", "data.workers=0", "model=fcnn", "model.width=8"]
+    sizes = [
+        "data.train=6",
+        "data.val=2",
+        "data.test=2",
+        "data.workers=0",
+        "model=fcnn",
+        "model.width=8",
+    ]
     ended = script(
         "train", "mesh=file", "mesh.path=part.msh", "loads.n_modes=2", "solver.linear=superlu",
         *sizes, "trainer.max_epochs=1", "trainer.check_val_every_n_epoch=1", "run=part",
