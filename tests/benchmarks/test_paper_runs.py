@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
@@ -128,7 +129,7 @@ def assert_valid(run, composed):
     for option in run.options:
         key, _, value = option.partition("=")
         if key.startswith(("trainer.", "data.train", "model.width")):
-            assert str(OmegaConf.select(cfg, key)) == value, (run.path, option)
+            assert OmegaConf.select(cfg, key) == yaml.safe_load(value), (run.path, option)
 
 
 def shipped(scale):
