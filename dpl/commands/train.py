@@ -5,6 +5,7 @@ import re
 import shlex
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -82,6 +83,7 @@ def _train(cfg: DictConfig) -> float | None:
     if trainer.is_global_zero:
         verbose = cli.extra(cfg, "verbose")
         config.show_plan(scene, module, surrogate, folder=_from_here(folder), verbose=verbose)
+        _show_unused(surrogate, unused)
         if not trainer.fast_dev_run:
             config.save_config(cfg, folder)
     smallest: float | None = None
@@ -128,6 +130,17 @@ def _train(cfg: DictConfig) -> float | None:
     if cli.extra(cfg, "view"):
         _view(best, folder)
     return cli.best_error(trainer) if smallest is None else smallest
+
+
+def _show_unused(surrogate: "dpl.Surrogate", unused: Sequence[str]) -> None:
+    """Print which overrides have no effect on a model that is fitted."""
+    lines = [line.lstrip("+") for line in HydraConfig.get().overrides.task]
+    others = "trainer=", "trainer.accelerator", "trainer.fast_dev_run"  # hardware, rehearsals
+    given = [one for one in lines if one.startswith(tuple(unused)) and not one.startswith(others)]
+    if given:
+        name = type(surrogate.net).__name__
+        why = f"{name} is fitted by regression; choose a network, for example model=fcnn"
+        print(f"note: {', '.join(given)}: no effect, since {why}", file=sys.stderr)
 
 
 def _fit(
