@@ -1,25 +1,19 @@
 """Laws, small bodies and loads that the tests of the mechanics share."""
 
-import io
-import json
-import subprocess
 from collections.abc import Callable
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import skfem
 import torch
 from laws import ISOTROPIC, LAWS
+from solving import LENGTH, YOUNG
 from torch import Tensor
 
 from dpl import fem
 from dpl.fem.linear import SuperLU
 from dpl.fem.loads import traction
-from dpl.fem.mesh import sandbox, sandbox_worker
 
-YOUNG, LENGTH = 4500.0, 100.0  # of the paper's beam [Pa], [m]
 KINDS = [(cell, d) for cell in ("triangle", "quad", "tetra", "hexahedron") for d in (1, 2)]
 
 
@@ -33,6 +27,12 @@ def law(request) -> fem.Material:
 def laws() -> dict[str, fem.Material]:
     """All laws by name."""
     return LAWS
+
+
+@pytest.fixture(params=[False, True], ids=["plain", "mixed"])
+def mixed(request) -> bool:
+    """Both kinds of Newton: without and with mixed integration points."""
+    return request.param
 
 
 @pytest.fixture(params=LAWS)
@@ -138,20 +138,6 @@ def corner() -> Callable[[fem.Problem, Tensor], Tensor]:
         return displacement[0, int(problem.points.sum(dim=1).argmax())]
 
     return corner
-
-
-@pytest.fixture
-def in_process(monkeypatch) -> None:
-    """Read mesh files in this process, which is faster than the start of one for each."""
-
-    def run(program: list[str], **_: object) -> subprocess.CompletedProcess:
-        arrays: dict[str, np.ndarray] = {}
-        answer, output = sandbox_worker.read(Path(program[4]), arrays), io.BytesIO()
-        np.savez(output, answer=np.array(json.dumps(answer)), **arrays)
-        return subprocess.CompletedProcess(program, 0, output.getvalue())
-
-    names = {name: getattr(subprocess, name) for name in ("DEVNULL", "PIPE", "TimeoutExpired")}
-    monkeypatch.setattr(sandbox, "subprocess", SimpleNamespace(run=run, **names))
 
 
 @pytest.fixture
