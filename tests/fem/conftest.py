@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import skfem
 import torch
-from laws import ISOTROPIC, LAWS
+from laws import LAWS
 from solving import LENGTH, YOUNG
 from torch import Tensor
 
@@ -33,18 +33,6 @@ def laws() -> dict[str, fem.Material]:
 def mixed(request) -> bool:
     """Both kinds of Newton: without and with mixed integration points."""
     return request.param
-
-
-@pytest.fixture(params=LAWS)
-def any_law(request) -> fem.Material:
-    """Each of all laws."""
-    return LAWS[request.param]
-
-
-@pytest.fixture(params=ISOTROPIC)
-def isotropic_law(request) -> fem.Material:
-    """Each law without fibres."""
-    return LAWS[request.param]
 
 
 @pytest.fixture(params=KINDS, ids=lambda kind: f"{kind[0]}{kind[1]}")
@@ -138,6 +126,19 @@ def corner() -> Callable[[fem.Problem, Tensor], Tensor]:
         return displacement[0, int(problem.points.sum(dim=1).argmax())]
 
     return corner
+
+
+@pytest.fixture(scope="session")
+def newton(beam) -> fem.Newton:
+    """The reference solver of a small beam."""
+    return fem.Newton(beam(fem.NeoHookeanLn(0.3)), linear="superlu", tol=1e-10)
+
+
+@pytest.fixture(scope="session")
+def snapshots(newton) -> Tensor:
+    """Its solutions for sixty random loads of three modes, deflections of up to 0.4 L."""
+    family = fem.ModalLoads(newton.linear_solver, n_modes=3)
+    return fem.solve(newton, family.sample(0, range(60))).displacement
 
 
 @pytest.fixture

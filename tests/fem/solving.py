@@ -64,7 +64,7 @@ def poisson(ratio: float) -> float:
     return (3 * ratio - 2) / (6 * ratio + 2)
 
 
-def check_derivatives(problem: fem.Problem, u: Tensor, v: Tensor, rtol: float = 1e-11) -> None:
+def assert_derivatives(problem: fem.Problem, u: Tensor, v: Tensor, rtol: float = 1e-11) -> None:
     """Assert that the force is the slope of the energy, and the tangent that of the force.
 
     Args:

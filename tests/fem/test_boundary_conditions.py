@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from solving import bar, check_derivatives, rest, sliding
+from solving import assert_derivatives, bar, rest, sliding
 from torch.testing import assert_close
 
 from dpl import fem
@@ -260,7 +260,7 @@ def sprung(held, dim) -> fem.Problem:
 
 def test_force_and_tangent_on_springs_are_slopes_of_energy_and_force(sprung, bend):
     u = bend(sprung.points, 2)
-    check_derivatives(sprung, u, bend(sprung.points, 2, seed=1))
+    assert_derivatives(sprung, u, bend(sprung.points, 2, seed=1))
     assert_close(sprung.evaluate(u).internal, sprung.internal_force(u), rtol=1e-11, atol=1e-13)
     tangent = sprung.linearise(u[:1]).tangent
     assert_close(tangent, sprung.tangent(u[:1]), rtol=1e-10, atol=1e-13)
@@ -308,5 +308,7 @@ def test_copies_on_a_device_and_by_pickle_contain_the_springs(sprung, bend):
     for copy in (sprung.to("cpu"), pickle.loads(pickle.dumps(sprung))):
         assert torch.equal(copy.internal_force(u), sprung.internal_force(u))
         assert torch.equal(copy.linearise(u).tangent, sprung.linearise(u).tangent)
+        assert copy.length == sprung.length
+        assert replace(copy, material=NH).pattern is copy.pattern
     bare = replace(sprung, springs=None)
     assert (bare.internal_force(u) - sprung.internal_force(u)).abs().max() > 1e-4

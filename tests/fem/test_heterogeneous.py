@@ -8,7 +8,7 @@ import skfem
 import torch
 from laws import LAWS
 from skfem.io.meshio import to_meshio
-from solving import check_derivatives, load_of, rest, uncompiled
+from solving import assert_derivatives, load_of, rest, uncompiled
 
 from dpl import fem
 from dpl.fem.postprocess import RestStiffness
@@ -72,7 +72,7 @@ def test_loops_of_several_laws_are_those_of_the_tensors(pair):
 def test_force_and_tangent_are_the_slopes_of_energy_and_force(pair):
     problem = body(*PAIRS[pair])
     u = displacement(problem)
-    check_derivatives(problem, u, u.flip(1))
+    assert_derivatives(problem, u, u.flip(1))
 
 
 def test_regions_of_one_law_are_a_body_of_this_law():

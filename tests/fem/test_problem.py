@@ -1,7 +1,6 @@
 """Laws of the discrete body: element matrices, consistency, invariance, supports."""
 
 import math
-import pickle
 import re
 import warnings
 from dataclasses import replace
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 import skfem
 import torch
-from solving import LENGTH, YOUNG, Uncompiled, check_derivatives, load_of, rest
+from solving import LENGTH, YOUNG, Uncompiled, assert_derivatives, load_of, rest
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -168,7 +167,7 @@ def test_force_and_tangent_are_slopes_of_energy_and_force(body, bend):
     assert not body.discretisation.equal_cells
     u, v = bend(body.points, 3), bend(body.points, 3, seed=1)
     assert (body.volume_ratio(u) > 0.3).all()
-    check_derivatives(body, u, v)
+    assert_derivatives(body, u, v)
 
 
 def test_mixed_points_in_agreement_give_force_and_tangent(body, bend):
@@ -294,21 +293,6 @@ def test_residual_ratio_is_relative_to_the_load(held, bend):
     assert_close(held.relative_residual(zero, ones), torch.ones(2, dtype=torch.float64))
 
 
-def test_forces_on_held_nodes_do_not_count(held, bend):
-    """Reactions, as programs export them with the loads, must not make an answer look better."""
-    u, f = bend(held.points, 2), bend(held.points, 2, seed=1)
-    internal, free = held.internal_force(u), torch.where(held.free, f, 0.0)
-    ratio = held.relative_residual_of(internal, free)
-    for size in (1.0, 1e10, 1e200):
-        pinned = torch.where(held.free, f, size)
-        assert_close(held.relative_residual_of(internal, pinned), ratio, rtol=1e-14, atol=0)
-        assert torch.equal(held.acting(pinned), free)
-        assert not held.is_equilibrium(u, internal, pinned, 0.9 * float(ratio.min())).any()
-    only = torch.where(held.free, 0.0, 1e10).expand_as(f).to(f)
-    assert not held.acting(only).any()
-    assert_close(held.relative_residual(u, only), held.residual(u, only).flatten(1).norm(dim=1))
-
-
 @pytest.mark.parametrize("power", [-290, -158, 158, 290])
 def test_a_ratio_does_not_depend_on_the_size_of_the_forces(bent, power):
     """Squares of these numbers are 0 or infinite in float64."""
@@ -323,27 +307,6 @@ def test_a_ratio_does_not_depend_on_the_size_of_the_forces(bent, power):
     for tol, met in ((1.01 * float(ratio), True), (0.99 * float(ratio), False)):
         found = problem.is_equilibrium(size * u, size * internal, size * force, tol)
         assert found.item() is met
-
-
-@pytest.mark.parametrize("size", [1e-300, 5e-324])
-def test_forces_that_arithmetic_cannot_resolve_are_balanced_by_nothing(bent, size):
-    problem, force, u = bent
-    faint = size * (problem.acting(force) / problem.acting(force).abs().max())
-    assert faint.any()
-    for internal in (faint, 0 * faint):
-        assert problem.relative_residual_of(internal, faint).isnan()
-        assert not problem.is_equilibrium(u, internal, faint, 1e-8)
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_load_that_is_not_finite_on_held_nodes_is_balanced_by_nothing(beam, bad):
-    """No displacement feels it, but relative to it every residual is small."""
-    problem = beam(NH, 2, 1)
-    zero = rest(problem)
-    force = torch.full_like(zero, 1e-9)
-    force[0, (~problem.free).any(dim=1).nonzero()[0, 0], 0] = bad
-    assert problem.relative_residual(zero, force).isnan()
-    assert not problem.is_equilibrium(zero, zero, force, 1e-8)
 
 
 def test_reactions_count_as_load_where_supports_move(grid, bend):
@@ -461,15 +424,6 @@ def test_motions_that_no_support_holds_are_named(grid, cell, fixed, names):
         axis, components = fixed
         fixed = (mesh.p[axis] == 0)[:, None] & np.array(components)
     assert fem.Problem.build(mesh, NH, fixed=fixed).unconstrained_rigid_body_modes() == names
-
-
-def test_copy_on_a_device_and_copy_by_pickle_are_the_same_problem(bent):
-    problem, force, u = bent
-    for copy in (problem.to("cpu"), pickle.loads(pickle.dumps(problem))):
-        assert torch.equal(copy.internal_force(u), problem.internal_force(u))
-        assert torch.equal(copy.relative_residual(u, force), problem.relative_residual(u, force))
-        assert copy.length == problem.length
-        assert replace(copy, material=NH).pattern is copy.pattern
 
 
 def test_strain_of_no_deformation_is_not_valid(kind, grid):

@@ -12,8 +12,6 @@ from dpl import fem
 from dpl.fem.rom.ecsw import cubature, nonnegative
 from dpl.fem.rom.pod import pod
 
-NH = fem.NeoHookeanLn(0.3)
-
 
 def reduced(problem: fem.Problem, fields: torch.Tensor, rank: int) -> tuple[torch.Tensor, ...]:
     """Return an orthonormal basis of fields (S, N, D), (N, D, R), and their projections onto it."""
@@ -21,20 +19,6 @@ def reduced(problem: fem.Problem, fields: torch.Tensor, rank: int) -> tuple[torc
     vectors = torch.zeros(*problem.shape, rank, dtype=torch.float64)
     vectors[problem.free] = basis
     return vectors, torch.einsum("bnd,ndr,mer->bme", fields, vectors, vectors)
-
-
-@pytest.fixture(scope="module")
-def newton(beam) -> fem.Newton:
-    """The beam's reference solver."""
-    return fem.Newton(beam(NH), linear="superlu", tol=1e-10)
-
-
-@pytest.fixture(scope="module")
-def snapshots(newton) -> torch.Tensor:
-    """Solutions for sixty random loads of three modes, deflections of up to 0.4 L."""
-    return fem.solve(
-        newton, fem.ModalLoads(newton.linear_solver, n_modes=3).sample(0, range(60))
-    ).displacement
 
 
 @pytest.mark.parametrize("shape", [(7, 40), (40, 7), (12, 12)], ids=str)
