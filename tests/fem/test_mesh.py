@@ -377,23 +377,20 @@ def test_a_valid_file_is_read_without_a_warning(tmp_path):
             assert fem.read_mesh(path).nelements == len(cells)
 
 
-NUMBERS = {  # format: file, a node of it, the same with the number of another, words
-    "gmsh22": ("cube.msh", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
-    "gmsh": ("cube.msh", "\n4\n5\n", "\n3\n5\n", r"1 node numbers .* more than once: 3"),
-    "abaqus": ("cube.inp", "\n4, 0.0", "\n3, 0.0", r"1 node numbers .* more than once: 3"),
-    "permas": ("cube.dato", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
-    "avsucd": ("cube.avs", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
-    "nastran": (
-        *("cube.bdf", "BEGIN BULK\n", "BEGIN BULK\nGRID,3,,9.0,9.0,9.0\n"),
-        r"1 node numbers .* more than once: 3",
-    ),
+NUMBERS = {  # format: file, a node of it, the same with the number of another
+    "gmsh22": ("cube.msh", "\n4 0.0", "\n3 0.0"),
+    "gmsh": ("cube.msh", "\n4\n5\n", "\n3\n5\n"),
+    "abaqus": ("cube.inp", "\n4, 0.0", "\n3, 0.0"),
+    "permas": ("cube.dato", "\n4 0.0", "\n3 0.0"),
+    "avsucd": ("cube.avs", "\n4 0.0", "\n3 0.0"),
+    "nastran": ("cube.bdf", "BEGIN BULK\n", "BEGIN BULK\nGRID,3,,9.0,9.0,9.0\n"),
 }
 
 
 @pytest.mark.parametrize("kind", NUMBERS)
 def test_a_node_number_that_is_listed_twice_is_an_error_that_names_it(tmp_path, kind):
     """Meshio would use the last node of that number, wherever it is."""
-    name, own, other, reported = NUMBERS[kind]
+    name, own, other = NUMBERS[kind]
     path = tmp_path / name
     binary = {"binary": False} if kind.startswith("gmsh") else {}
     meshio.write(path, meshio.Mesh(CORNERS, [("tetra", TETS)]), file_format=kind, **binary)
@@ -401,7 +398,7 @@ def test_a_node_number_that_is_listed_twice_is_an_error_that_names_it(tmp_path, 
     text = path.read_text()
     assert text.count(own) == 1
     path.write_text(text.replace(own, other))
-    with pytest.raises(ValueError, match=reported) as error:
+    with pytest.raises(ValueError, match="1 node numbers .* more than once: 3") as error:
         fem.read_mesh(path)
     assert "\n" not in str(error.value)
 
