@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from dpl import fem
-from dpl.fem.linear import full_matrix
+from dpl.fem.linear import SuperLU, full_matrix
 
 YOUNG, LENGTH = 4500.0, 100.0  # of the paper's beam [Pa], [m]
 
@@ -57,6 +57,12 @@ def without_load(problem: fem.Problem, guess: Tensor | None = None, **options) -
     """Return the last solution of Newton's method under the supports and follower loads alone."""
     *_, last = fem.Newton(problem, **options).iterate(load_of(rest(problem)), guess=guess)
     return last
+
+
+def inertia(problem: fem.Problem, displacement: Tensor) -> int:
+    """Return the number of negative eigenvalues of K at a displacement (1, N, D)."""
+    tangent = problem.linearise(displacement).tangent[0].numpy()
+    return SuperLU(problem.pattern).factorise(tangent).negative_pivots
 
 
 def poisson(ratio: float) -> float:

@@ -3,16 +3,17 @@
 import math
 import pickle
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import cycle, pairwise
 
 import numpy as np
 import pytest
 import torch
 from laws import LAWS
-from solving import load_of
+from solving import inertia, load_of
 from torch import Tensor
 
+from benchmarks.stress.fixtures import column, cube
 from dpl import fem
 from dpl.fem.linear import BandedCholesky, Pardiso, SuperLU, multigrid_installed
 from dpl.fem.linear.interface import UNKNOWN, UNSTABLE, Stability
@@ -271,34 +272,11 @@ def test_the_next_factor_takes_the_storage_of_an_unused_one(beam, pull, monkeypa
 # ---- stability
 
 
-@cache
-def column(law: fem.Material) -> tuple[fem.Problem, Tensor]:
-    """Return a column of 10 x 1 x 1 m, E = 1000 Pa, and the axial load P = 1."""
-    mesh = fem.box([10.0, 1.0, 1.0], [11, 2, 2])
-    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=2)
-    return problem, fem.Traction(fem.Plane(0, "max"), [-1 / 1000, 0.0, 0.0]).on(problem)
-
-
-@cache
-def cube(poisson: float) -> tuple[fem.Problem, Tensor]:
-    """Return the cube of Rivlin (1948) on three symmetry planes, and T = 1 on the other faces."""
-    mesh = fem.box([1.0, 1.0, 1.0], [2, 2, 2])
-    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(poisson), fixed=mesh.p.T == 0, length=1.0)
-    normals = torch.eye(3).tolist()
-    return problem, sum(fem.Traction(fem.Plane(i, "max"), normals[i]).on(problem) for i in range(3))
-
-
-def negative(problem: fem.Problem, displacement: Tensor) -> int:
-    """Return the number of negative eigenvalues of K at a displacement (1, N, D)."""
-    tangent = problem.linearise(displacement).tangent[0].numpy()
-    return SuperLU(problem.pattern).factorise(tangent).negative_pivots
-
-
 BODIES = {  # body with its unit load, critical load (independent code)
-    "SVK column": (partial(column, fem.SaintVenantKirchhoff(0.0)), 2.039763),
-    "NH column": (partial(column, fem.NeoHookeanLn(0.0)), 2.056558),
-    "cube, nu = .45": (partial(cube, 0.45), 0.7475041023),
-    "cube, nu = .49": (partial(cube, 0.49), 0.6804639956),
+    "SVK column": (partial(column, fem.SaintVenantKirchhoff(0.0), (10, 1, 1)), 2.039763),
+    "NH column": (partial(column, fem.NeoHookeanLn(0.0), (10, 1, 1)), 2.056558),
+    "cube, nu = .45": (partial(cube, fem.NeoHookeanLn(0.45), 1, (0, 1, 2)), 0.7475041023),
+    "cube, nu = .49": (partial(cube, fem.NeoHookeanLn(0.49), 1, (0, 1, 2)), 0.6804639956),
 }
 BEYOND = (1.0005, 1.002, 1.05)
 
@@ -307,9 +285,9 @@ BEYOND = (1.0005, 1.002, 1.05)
 @pytest.mark.parametrize(
     ("name", "part", "linear", "reuse"),
     [
-        (name, part, "superlu", (0.0, 0.1, 1.0)[(row + column) % 3])
+        (name, part, "superlu", (0.0, 0.1, 1.0)[(row + number) % 3])
         for row, name in enumerate(BODIES)
-        for column, part in enumerate(BEYOND)
+        for number, part in enumerate(BEYOND)
     ]
     + [
         ("SVK column", 1.001, linear, reuse)
@@ -327,7 +305,7 @@ def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, l
     problem, unit = build()
     answer = fem.solve(fem.Newton(problem, **options), load_of(part * critical * unit[None]))
     assert answer.converged.all()
-    assert negative(problem, answer.displacement) == 2
+    assert inertia(problem, answer.displacement) == 2
     assert answer.status.item() == fem.Status.UNSTABLE
     assert answer.negative_pivots.item() == 2
 
@@ -338,7 +316,7 @@ def test_load_below_a_critical_one_is_stable_whatever_is_reused(name):
     build, critical = BODIES[name]
     problem, unit = build()
     every, few = pair(problem, load_of(0.999 * critical * unit[None]), tol=1e-10)
-    assert negative(problem, few.displacement) == 0
+    assert inertia(problem, few.displacement) == 0
     assert few.status.item() == fem.Status.CONVERGED
     check(every, few, fewer=False)
 
@@ -346,7 +324,7 @@ def test_load_below_a_critical_one_is_stable_whatever_is_reused(name):
 @pytest.mark.parametrize(("P", "linear"), [(2.1, "superlu"), (2.5, "band"), (4.0, "superlu")])
 def test_factor_with_negative_pivots_is_never_reused(monkeypatch, P, linear):
     """Conjugate gradients need a positive definite preconditioner."""
-    problem, unit = column(fem.SaintVenantKirchhoff(0.0))
+    problem, unit = BODIES["SVK column"][0]()
     used, met, original = [], [], SuperLU.factorise
 
     def watched(self, values):
@@ -367,7 +345,7 @@ def test_factor_with_negative_pivots_is_never_reused(monkeypatch, P, linear):
 
 
 def test_straight_column_far_beyond_is_the_same_with_and_without_reuse():
-    problem, unit = column(fem.SaintVenantKirchhoff(0.0))
+    problem, unit = BODIES["SVK column"][0]()
     for P in (2.1, 2.5, 4.0):
         every, few = pair(problem, load_of(P * unit[None]), tol=1e-10)
         assert few.status.item() == every.status.item() == fem.Status.UNSTABLE

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from solving import inertia
 from torch import Tensor
 
 from benchmarks.stress.fixtures import (
@@ -19,7 +20,6 @@ from benchmarks.stress.fixtures import (
     uniaxial_stretch,
 )
 from dpl import fem
-from dpl.fem.linear import SuperLU
 
 # a cell that is uniformly strained does not lock
 pytestmark = [
@@ -29,12 +29,6 @@ pytestmark = [
 
 SVK, NH = fem.SaintVenantKirchhoff(0.0), fem.NeoHookeanLn(0.0)
 EYE = torch.eye(3, dtype=torch.float64)
-
-
-def inertia(problem: fem.Problem, displacement: Tensor) -> int:
-    """Return the number of negative eigenvalues of K at a displacement (1, N, D)."""
-    tangent = problem.linearise(displacement).tangent[0].numpy()
-    return SuperLU(problem.pattern).factorise(tangent).negative_pivots
 
 
 def loses_symmetry(problem, stretch: float) -> bool:
