@@ -398,7 +398,7 @@ def test_a_node_number_that_is_listed_twice_is_an_error_that_names_it(tmp_path, 
     text = path.read_text()
     assert text.count(own) == 1
     path.write_text(text.replace(own, other))
-    with pytest.raises(ValueError, match="1 node numbers .* more than once: 3") as error:
+    with pytest.raises(ValueError, match=r"1 node numbers .* more than once: 3") as error:
         fem.read_mesh(path)
     assert "\n" not in str(error.value)
 
