@@ -28,7 +28,6 @@ pytestmark = [
 ]
 
 SVK, NH = fem.SaintVenantKirchhoff(0.0), fem.NeoHookeanLn(0.0)
-EYE = torch.eye(3, dtype=torch.float64)
 
 
 def loses_symmetry(problem, stretch: float) -> bool:

@@ -25,16 +25,10 @@ CORNER = skfem.MeshTet(
 CUBE = fem.box([1.0, 1.0, 1.0], [2, 2, 2])
 
 
-def stiffness(problem: fem.Problem, displacement: Tensor | None = None) -> np.ndarray:
-    """Return K over the free degrees of freedom, at rest if no displacement is given."""
-    values = problem.tangent(rest(problem) if displacement is None else displacement)
-    return full_matrix(problem.pattern, values[0].numpy()).toarray()
-
-
-def rotation() -> Tensor:
-    """Return a rotation about no special axis."""
-    skew = torch.tensor([[0, -0.4, 0.9], [0.4, 0, -0.2], [-0.9, 0.2, 0]], dtype=torch.float64)
-    return torch.matrix_exp(skew)
+def stiffness(problem: fem.Problem) -> np.ndarray:
+    """Return K(0) over the free degrees of freedom."""
+    values = problem.tangent(rest(problem))[0]
+    return full_matrix(problem.pattern, values.numpy()).toarray()
 
 
 # By another code: mesh, degree, eigenvalues from below, number of them in all, largest, trace
