@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -47,17 +48,24 @@ ERRORS: dict[tuple[str, int], tuple[list[int], str, str]] = {
 }
 
 
-def manufactured(x: Tensor) -> Tensor:
+def manufactured(x: Tensor, amplitude: float = 0.1) -> Tensor:
     """Return the manufactured displacement (3,) at a point (3,) of the unit cube."""
     X, Y, Z = math.pi * x
     u = (X.sin() * (Y / 2).cos(), (Y / 2).cos() * Z.sin(), x[1] * (X / 2).sin() * Z.sin())
-    return 0.1 * torch.stack(u)
+    return amplitude * torch.stack(u)
 
 
-def errors(cell: str, degree: int, n: int) -> tuple[float, float]:
-    """Return the errors of the manufactured solution on n^3 cells in L2 and the H1-seminorm [-]."""
-    law = NeoHookeanLn(0.3)
-    gradient = torch.func.jacrev(manufactured)
+def errors(
+    cell: str, degree: int, n: int, law: Material | None = None, amplitude: float = 0.1,
+    *, mean_dilatation: bool = False,
+) -> tuple[float, float]:  # fmt: skip
+    """Return the errors of the manufactured solution on n^3 cells in L2 and the H1-seminorm [-].
+
+    The law is NH-ln with a Poisson's ratio of 0.3 if left out.
+    """
+    law = law or NeoHookeanLn(0.3)
+    exact = partial(manufactured, amplitude=amplitude)
+    gradient = torch.func.jacrev(exact)
 
     def load(x: Tensor) -> Tensor:  # -Div P
         return -torch.einsum(
@@ -71,15 +79,16 @@ def errors(cell: str, degree: int, n: int) -> tuple[float, float]:
 
     mesh = box([1.0] * 3, [n + 1] * 3, cell)
     bare = Problem.build(mesh, law, degree=degree, length=1.0)
-    given = torch.func.vmap(manufactured)(bare.points).numpy()
+    given = torch.func.vmap(exact)(bare.points).numpy()
     problem = Problem.build(
-        mesh, law, fixed=bare.boundary.numpy(), prescribed=given, degree=degree, length=1.0
-    )
+        mesh, law, fixed=bare.boundary.numpy(), prescribed=given, degree=degree, length=1.0,
+        mean_dilatation=mean_dilatation,
+    )  # fmt: skip
     force = body_force(problem, lambda x: at(load, x))
     answer = balanced(Newton(problem), force).displacement[0].numpy()
     fine = skfem.Basis(mesh, problem.basis.elem, intorder=7)
     x = np.asarray(fine.global_coordinates())
-    u, slope = at(manufactured, x), at(gradient, x)
+    u, slope = at(exact, x), at(gradient, x)
     found = [fine.interpolate(component) for component in answer.T]
     off = sum((np.asarray(f) - u[i]) ** 2 for i, f in enumerate(found))
     off_slope = sum(((f.grad - slope[i]) ** 2).sum(axis=0) for i, f in enumerate(found))

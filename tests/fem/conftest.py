@@ -1,25 +1,19 @@
 """Laws, small bodies and loads that the tests of the mechanics share."""
 
-import io
-import json
-import subprocess
 from collections.abc import Callable
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import skfem
 import torch
-from laws import ISOTROPIC, LAWS
+from laws import LAWS
+from solving import LENGTH, YOUNG
 from torch import Tensor
 
 from dpl import fem
 from dpl.fem.linear import SuperLU
 from dpl.fem.loads import traction
-from dpl.fem.mesh import sandbox, sandbox_worker
 
-YOUNG, LENGTH = 4500.0, 100.0  # of the paper's beam [Pa], [m]
 KINDS = [(cell, d) for cell in ("triangle", "quad", "tetra", "hexahedron") for d in (1, 2)]
 
 
@@ -35,16 +29,10 @@ def laws() -> dict[str, fem.Material]:
     return LAWS
 
 
-@pytest.fixture(params=LAWS)
-def any_law(request) -> fem.Material:
-    """Each of all laws."""
-    return LAWS[request.param]
-
-
-@pytest.fixture(params=ISOTROPIC)
-def isotropic_law(request) -> fem.Material:
-    """Each law without fibres."""
-    return LAWS[request.param]
+@pytest.fixture(params=[False, True], ids=["plain", "mixed"])
+def mixed(request) -> bool:
+    """Both kinds of Newton: without and with mixed integration points."""
+    return request.param
 
 
 @pytest.fixture(params=KINDS, ids=lambda kind: f"{kind[0]}{kind[1]}")
@@ -140,18 +128,17 @@ def corner() -> Callable[[fem.Problem, Tensor], Tensor]:
     return corner
 
 
-@pytest.fixture
-def in_process(monkeypatch) -> None:
-    """Read mesh files in this process, which is faster than the start of one for each."""
+@pytest.fixture(scope="session")
+def newton(beam) -> fem.Newton:
+    """The reference solver of a small beam."""
+    return fem.Newton(beam(fem.NeoHookeanLn(0.3)), linear="superlu", tol=1e-10)
 
-    def run(program: list[str], **_: object) -> subprocess.CompletedProcess:
-        arrays: dict[str, np.ndarray] = {}
-        answer, output = sandbox_worker.read(Path(program[4]), arrays), io.BytesIO()
-        np.savez(output, answer=np.array(json.dumps(answer)), **arrays)
-        return subprocess.CompletedProcess(program, 0, output.getvalue())
 
-    names = {name: getattr(subprocess, name) for name in ("DEVNULL", "PIPE", "TimeoutExpired")}
-    monkeypatch.setattr(sandbox, "subprocess", SimpleNamespace(run=run, **names))
+@pytest.fixture(scope="session")
+def snapshots(newton) -> Tensor:
+    """Its solutions for sixty random loads of three modes, deflections of up to 0.4 L."""
+    family = fem.ModalLoads(newton.linear_solver, n_modes=3)
+    return fem.solve(newton, family.sample(0, range(60))).displacement
 
 
 @pytest.fixture

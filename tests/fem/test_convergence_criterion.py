@@ -13,25 +13,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from dpl import fem
 from dpl.data.solving.solve import LoadKey, failed_load, solve_load
-from dpl.fem import (
-    AndersonSolver,
-    LinearElastic,
-    LinearSolver,
-    Load,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    Solution,
-    Status,
-    Traction,
-    box,
-    evaluate_solution,
-    post_buckling_branches,
-    solve,
-)
 from dpl.fem.linear import conjugate_gradients
 from dpl.inference import Direct, Hybrid
 from dpl.inference.hybrid import RULES
@@ -41,34 +24,36 @@ ONE = torch.ones(1, dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
-def newton() -> Newton:
+def newton() -> fem.Newton:
     """A beam 4 x 1 x 1 of 24 hexahedra."""
-    problem = Problem.build(box([4.0, 1, 1], [7, 3, 3]), NeoHookeanLn(0.3), fixed=Plane(0, "min"))
-    return Newton(problem, linear="superlu")
+    problem = fem.Problem.build(
+        fem.box([4.0, 1, 1], [7, 3, 3]), fem.NeoHookeanLn(0.3), fixed=fem.Plane(0, "min")
+    )
+    return fem.Newton(problem, linear="superlu")
 
 
 @pytest.fixture(scope="module")
-def load(newton) -> Load:
+def load(newton) -> fem.Load:
     """A traction across its end, which moves that by a tenth of the length."""
-    force = Traction(Plane(0, "max"), [1e-4, 0.0, -1e-3]).on(newton.problem)
-    return Load(force[None], ONE)
+    force = fem.Traction(fem.Plane(0, "max"), [1e-4, 0.0, -1e-3]).on(newton.problem)
+    return fem.Load(force[None], ONE)
 
 
 @pytest.fixture(scope="module")
 def solvers(newton, load):
     """Every solver: from a load to its last solution."""
-    exact = solve(newton, load).displacement
+    exact = fem.solve(newton, load).displacement
     assert 0.05 < exact.norm(dim=-1).max() < 0.5
     problem, guess = newton.problem, 1.001 * exact
     hybrids = {rule: Hybrid(lambda load: guess, newton, rule) for rule in RULES}
-    hybrids["steps"] = Hybrid(lambda load: guess, newton, steps=AndersonSolver(newton))
+    hybrids["steps"] = Hybrid(lambda load: guess, newton, steps=fem.AndersonSolver(newton))
     return {
-        "newton": partial(solve, newton),
+        "newton": partial(fem.solve, newton),
         "newton from a guess": lambda load: [*newton.iterate(load, guess=guess)][-1],
-        "accelerated": lambda load: [*AndersonSolver(newton).iterate(load, guess=guess)][-1],
-        "linear": partial(solve, newton.linear_solver),
-        "direct": partial(solve, Direct(lambda load: guess, problem)),
-        **{f"hybrid, {name}": partial(solve, hybrid) for name, hybrid in hybrids.items()},
+        "accelerated": lambda load: [*fem.AndersonSolver(newton).iterate(load, guess=guess)][-1],
+        "linear": partial(fem.solve, newton.linear_solver),
+        "direct": partial(fem.solve, Direct(lambda load: guess, problem)),
+        **{f"hybrid, {name}": partial(fem.solve, hybrid) for name, hybrid in hybrids.items()},
     }
 
 
@@ -78,7 +63,7 @@ SOLVERS = [
 ]
 
 
-def same(one: Solution, other: Solution) -> bool:
+def same(one: fem.Solution, other: fem.Solution) -> bool:
     """Return whether two solutions are one, but for the time that they took."""
     pairs = zip(one._replace(seconds=other.seconds), other, strict=True)
     return all(torch.equal(a, b) for a, b in pairs)
@@ -130,15 +115,15 @@ def test_loads_that_arithmetic_cannot_resolve_are_never_answered(load, solvers, 
 
 
 TAKERS = {
-    "newton": lambda newton, tol: Newton(newton.problem, tol=tol),
+    "newton": lambda newton, tol: fem.Newton(newton.problem, tol=tol),
     "changed newton": lambda newton, tol: replace(newton, tol=tol),
-    "linear": lambda newton, tol: LinearSolver(newton.problem, tol=tol),
+    "linear": lambda newton, tol: fem.LinearSolver(newton.problem, tol=tol),
     "direct": lambda newton, tol: Direct(lambda load: load.force, newton.problem, tol),
     "view settings": lambda newton, tol: ViewSettings(tol=tol),
-    "judge": lambda newton, tol: evaluate_solution(
+    "judge": lambda newton, tol: fem.evaluate_solution(
         newton.problem,
         torch.zeros(1, *newton.problem.shape, dtype=torch.float64),
-        Load(torch.zeros(1, *newton.problem.shape, dtype=torch.float64), ONE),
+        fem.Load(torch.zeros(1, *newton.problem.shape, dtype=torch.float64), ONE),
         tol,
     ),
 }
@@ -159,11 +144,11 @@ def test_a_tolerance_in_range_is_taken(newton, name, tol):
 
 def test_only_newton_takes_for_balance_what_rounding_leaves(newton, load):
     """It has tried; of a prediction whose residual is small no one knows that it is the least."""
-    exact = solve(replace(newton, tol=1e-11), load).displacement
+    exact = fem.solve(replace(newton, tol=1e-11), load).displacement
     problem, tol = newton.problem, 1e-15
     for ratio in (
-        evaluate_solution(problem, exact, load, tol),
-        solve(LinearSolver(problem, tol), load),
+        fem.evaluate_solution(problem, exact, load, tol),
+        fem.solve(fem.LinearSolver(problem, tol), load),
     ):
         assert not ratio.converged.any()
     with pytest.warns(UserWarning, match="rounding allows no less"):
@@ -185,7 +170,7 @@ def test_a_right_hand_side_of_any_size_is_solved_by_conjugate_gradients():
 def test_where_a_load_lies_does_not_depend_on_forces_on_held_nodes(newton):
     weight = torch.full(newton.problem.shape, -1e-5, dtype=torch.float64)
     for always in (None, weight):
-        loads = ModalLoads(newton.linear_solver, n_modes=3, constant_force=always)
+        loads = fem.ModalLoads(newton.linear_solver, n_modes=3, constant_force=always)
         force = loads.sample(0, range(3)).force
         held = torch.where(newton.problem.free, force, 1e10)
         found, wanted = loads.project(held), loads.project(force)
@@ -196,7 +181,7 @@ def test_where_a_load_lies_does_not_depend_on_forces_on_held_nodes(newton):
 
 @pytest.mark.parametrize("power", [-290, -158, 0, 158])
 def test_where_a_load_lies_scales_with_it(newton, power):
-    loads = ModalLoads(newton.linear_solver, n_modes=3)
+    loads = fem.ModalLoads(newton.linear_solver, n_modes=3)
     force, size = loads.sample(0, range(3)).force, 10.0**power
     amplitude, out_of_span = loads.project(size * force)
     assert_close(amplitude / size, loads.project(force)[0], rtol=1e-9, atol=0)
@@ -220,13 +205,13 @@ def test_forces_on_held_nodes_do_not_bend_a_column(make_scene):
     force = torch.zeros(1, *problem.shape, dtype=torch.float64)
     end = problem.points[:, 0] == 1.0
     force[:, end, 0] = -2 * math.pi**2 / 4 * (0.1**4 / 12) / int(end.sum())
-    plain = Load(force, ONE)
-    held = Load(torch.where(problem.free, force, 1e3), ONE)
-    straight = solve(newton, plain)
-    assert straight.status[0] == Status.UNSTABLE
+    plain = fem.Load(force, ONE)
+    held = fem.Load(torch.where(problem.free, force, 1e3), ONE)
+    straight = fem.solve(newton, plain)
+    assert straight.status[0] == fem.Status.UNSTABLE
     for one, other in zip(
-        post_buckling_branches(newton, held, straight),
-        post_buckling_branches(newton, plain, straight),
+        fem.post_buckling_branches(newton, held, straight),
+        fem.post_buckling_branches(newton, plain, straight),
         strict=True,
     ):
         assert torch.equal(one.displacement, other.displacement)
@@ -234,18 +219,20 @@ def test_forces_on_held_nodes_do_not_bend_a_column(make_scene):
 
 def test_linear_elasticity_is_answered_in_one_step_as_long_as_no_cell_nearly_collapses(newton):
     """Its tangent is one for all loads; what ends the steps is min det F, which is not linear."""
-    problem = Problem.build(box([4.0, 1, 1], [7, 3, 3]), LinearElastic(0.3), fixed=Plane(0, "min"))
-    solver = Newton(problem, linear="superlu")
-    unit = Traction(Plane(0, "max"), [-1.0, 0.0, 0.0]).on(problem)[None]
+    problem = fem.Problem.build(
+        fem.box([4.0, 1, 1], [7, 3, 3]), fem.LinearElastic(0.3), fixed=fem.Plane(0, "min")
+    )
+    solver = fem.Newton(problem, linear="superlu")
+    unit = fem.Traction(fem.Plane(0, "max"), [-1.0, 0.0, 0.0]).on(problem)[None]
     straight = solver.linear_solver.solve(unit[0])[None]
 
-    def pressed(volume: float) -> tuple[float, Solution]:
+    def pressed(volume: float) -> tuple[float, fem.Solution]:
         low, high = 0.0, 2.0  # at which some point has det F of this volume ratio
         for _ in range(60):
             middle = (low + high) / 2
             above = float(problem.volume_ratio(middle * straight)) > volume
             low, high = (middle, high) if above else (low, middle)
-        return low, solve(solver, Load(low * unit, ONE))
+        return low, fem.solve(solver, fem.Load(low * unit, ONE))
 
     for volume in (0.9, 0.21):  # above `keep`
         size, answer = pressed(volume)
@@ -257,8 +244,8 @@ def test_linear_elasticity_is_answered_in_one_step_as_long_as_no_cell_nearly_col
     assert int(shortened.iterations) > 1
     assert_close(shortened.displacement, size * straight, rtol=1e-6, atol=1e-9)
     limit, _ = pressed(0.0)
-    beyond = solve(solver, Load(1.2 * limit * unit, ONE))
+    beyond = fem.solve(solver, fem.Load(1.2 * limit * unit, ONE))
     assert float(problem.volume_ratio(1.2 * limit * straight)) < 0
-    assert beyond.status.tolist() == [int(Status.NO_VALID_EQUILIBRIUM)]
+    assert beyond.status.tolist() == [int(fem.Status.NO_VALID_EQUILIBRIUM)]
     assert float(beyond.load_factor) <= 1 / 1.2
     assert float(beyond.load_factor) == pytest.approx(1 / 1.2, abs=0.05)

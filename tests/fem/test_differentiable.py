@@ -4,11 +4,10 @@ import pickle
 
 import pytest
 import torch
+from solving import LENGTH, load_of, noise, rest
 
 from dpl import fem
 from dpl.fem.linear import SuperLU
-
-YOUNG, LENGTH = 4500.0, 100.0
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +32,6 @@ def way(problem):
     return noise(2, *problem.shape, seed=1)
 
 
-def noise(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def loaded(force):
-    return fem.Load(force, torch.ones(len(force), dtype=torch.float64))
-
-
 def seen(displacement):
     """Return a smooth functional of each solution, (B,)."""
     weight = noise(*displacement.shape[1:], seed=2)
@@ -52,19 +43,19 @@ def slope_of(function, step):
 
 
 def test_the_solution_is_that_of_newton(equilibrium, force):
-    answer = equilibrium(loaded(force))
-    assert torch.equal(answer, fem.solve(equilibrium.newton, loaded(force)).displacement)
+    answer = equilibrium(load_of(force))
+    assert torch.equal(answer, fem.solve(equilibrium.newton, load_of(force)).displacement)
     assert answer.dtype == torch.float64
     assert not answer.requires_grad
 
 
 def test_the_gradient_by_forces_is_the_difference_quotient(equilibrium, force, way):
     inner = force.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(seen(equilibrium(loaded(inner))).sum(), inner)
+    (slope,) = torch.autograd.grad(seen(equilibrium(load_of(inner))).sum(), inner)
     size = float(force[0].norm() / way[0].norm())
 
     def along(step):
-        return seen(equilibrium(loaded(force + step * size * way)))
+        return seen(equilibrium(load_of(force + step * size * way)))
 
     found = (slope * way).sum(dim=(1, 2)) * size
     expected = slope_of(along, 1e-4)
@@ -74,7 +65,7 @@ def test_the_gradient_by_forces_is_the_difference_quotient(equilibrium, force, w
 
 def test_forces_on_fixed_nodes_have_no_gradient(problem, equilibrium, force):
     inner = force.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(seen(equilibrium(loaded(inner))).sum(), inner)
+    (slope,) = torch.autograd.grad(seen(equilibrium(load_of(inner))).sum(), inner)
     assert (slope[:, ~problem.free] == 0).all()
     assert (slope[:, problem.free] != 0).any()
 
@@ -99,15 +90,15 @@ def test_the_gradient_by_young_and_force_is_the_difference_quotient(scene, batch
 
 def test_a_batch_has_the_gradients_of_its_members(equilibrium, force):
     inner = force.clone().requires_grad_()
-    (whole,) = torch.autograd.grad(seen(equilibrium(loaded(inner))).sum(), inner)
+    (whole,) = torch.autograd.grad(seen(equilibrium(load_of(inner))).sum(), inner)
     for k in range(2):
         one = force[k : k + 1].clone().requires_grad_()
-        (slope,) = torch.autograd.grad(seen(equilibrium(loaded(one))).sum(), one)
+        (slope,) = torch.autograd.grad(seen(equilibrium(load_of(one))).sum(), one)
         assert torch.allclose(whole[k], slope[0], rtol=1e-9, atol=1e-12 * float(slope.abs().max()))
 
 
 def test_repeated_gradients_take_one_factorisation(equilibrium, force, monkeypatch):
-    answer = equilibrium(loaded(force.clone().requires_grad_()))
+    answer = equilibrium(load_of(force.clone().requires_grad_()))
     made = []
     factorise = SuperLU.factorise
     monkeypatch.setattr(SuperLU, "factorise", lambda *given: made.append(1) or factorise(*given))
@@ -121,7 +112,7 @@ def test_linear_bodies_have_the_same_gradient_everywhere(beam, pull):
     equilibrium = fem.DifferentiableSolve(fem.Newton(problem, linear="superlu"))
     force = torch.cat([pull(problem, 0.01), pull(problem, 1.0)]).requires_grad_()
     weight = noise(*problem.shape)
-    (slope,) = torch.autograd.grad((equilibrium(loaded(force)) * weight).sum(), force)
+    (slope,) = torch.autograd.grad((equilibrium(load_of(force)) * weight).sum(), force)
     adjoint = equilibrium.newton.linear_solver.solve(weight)
     assert torch.allclose(slope[0], adjoint, rtol=1e-8, atol=1e-10)
     assert torch.allclose(slope[1], adjoint, rtol=1e-8, atol=1e-10)
@@ -139,11 +130,11 @@ def test_moved_supports_and_springs_are_included(pull):
     equilibrium = fem.DifferentiableSolve(fem.Newton(problem, tol=1e-12, linear="superlu"))
     force, way = pull(problem, 5.0), noise(1, *problem.shape, seed=3)
     inner = force.clone().requires_grad_()
-    answer = equilibrium(loaded(inner))
+    answer = equilibrium(load_of(inner))
     assert torch.equal(answer[0][~problem.free], problem.prescribed[~problem.free])
     (slope,) = torch.autograd.grad(seen(answer).sum(), inner)
     size = 0.1 * float(force.norm() / way.norm())
-    expected = slope_of(lambda step: seen(equilibrium(loaded(force + step * size * way))), 1e-3)
+    expected = slope_of(lambda step: seen(equilibrium(load_of(force + step * size * way))), 1e-3)
     assert float((slope * way).sum()) * size == pytest.approx(float(expected), rel=1e-5)
 
 
@@ -152,14 +143,14 @@ def test_an_unstable_column_has_a_gradient(beam):
     problem = beam(fem.NeoHookeanLn(0.3), n=8, m=1)
     equilibrium = fem.DifferentiableSolve(fem.Newton(problem, tol=1e-12, linear="superlu"))
     tip = (problem.points[:, 0] == problem.points[:, 0].max()).double()
-    axial = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    axial = rest(problem)
     axial[0, :, 0] = -tip / tip.sum()
 
     def shortened(load):
-        return -equilibrium(loaded(load * axial))[0, :, 0].min()
+        return -equilibrium(load_of(load * axial))[0, :, 0].min()
 
     load = torch.tensor(0.006, dtype=torch.float64, requires_grad=True)
-    answer = equilibrium.solution(loaded(load.detach() * axial))
+    answer = equilibrium.solution(load_of(load.detach() * axial))
     assert answer.status.tolist() == [fem.Status.UNSTABLE]
     assert int(answer.negative_pivots) > 0
     (slope,) = torch.autograd.grad(shortened(load), load)
@@ -169,8 +160,8 @@ def test_an_unstable_column_has_a_gradient(beam):
 
 
 def test_a_guess_saves_iterations_and_changes_neither_solution_nor_gradient(equilibrium, force):
-    cold = loaded(force.clone().requires_grad_())
-    warm = loaded(force.clone().requires_grad_())
+    cold = load_of(force.clone().requires_grad_())
+    warm = load_of(force.clone().requires_grad_())
     first = equilibrium(cold)
     again = equilibrium(warm, guess=first)
     assert torch.allclose(first, again, rtol=0, atol=1e-10)
@@ -186,15 +177,15 @@ def test_error_names_the_loads_without_a_solution(problem, force):
     equilibrium = fem.DifferentiableSolve(fem.Newton(problem, linear="superlu", max_total_iter=2))
     too_large = torch.cat([0 * force[:1], 100 * force[1:]]).requires_grad_()
     with pytest.raises(ValueError, match="of 2 loads, load 1: not converged"):
-        equilibrium(loaded(too_large))
-    assert equilibrium.solution(loaded(too_large)).converged.tolist() == [True, False]
+        equilibrium(load_of(too_large))
+    assert equilibrium.solution(load_of(too_large)).converged.tolist() == [True, False]
 
 
 def test_a_critical_load_has_no_gradient(equilibrium, force, monkeypatch):
     def critical(backend, values):
         raise fem.SingularMatrix("a pivot is zero")
 
-    answer = equilibrium(loaded(force.clone().requires_grad_()))
+    answer = equilibrium(load_of(force.clone().requires_grad_()))
     monkeypatch.setattr(SuperLU, "factorise", critical)
     with pytest.raises(fem.SingularMatrix):
         answer.sum().backward()
@@ -202,13 +193,13 @@ def test_a_critical_load_has_no_gradient(equilibrium, force, monkeypatch):
 
 def test_float32_forces_get_float32_gradients(equilibrium, force):
     single = force.float().requires_grad_()
-    answer = equilibrium(loaded(single))
+    answer = equilibrium(load_of(single))
     assert answer.dtype == torch.float64
     answer.sum().backward()
     assert single.grad.dtype == torch.float32
 
 
 def test_a_differentiable_solve_can_be_pickled(equilibrium, force):
-    equilibrium(loaded(force.clone().requires_grad_())).sum().backward()
+    equilibrium(load_of(force.clone().requires_grad_())).sum().backward()
     twin = pickle.loads(pickle.dumps(equilibrium))
-    assert torch.equal(twin(loaded(force)), equilibrium(loaded(force)))
+    assert torch.equal(twin(load_of(force)), equilibrium(load_of(force)))

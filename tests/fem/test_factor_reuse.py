@@ -3,15 +3,17 @@
 import math
 import pickle
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import cycle, pairwise
 
 import numpy as np
 import pytest
 import torch
 from laws import LAWS
+from solving import inertia, load_of
 from torch import Tensor
 
+from benchmarks.stress.fixtures import column, cube
 from dpl import fem
 from dpl.fem.linear import BandedCholesky, Pardiso, SuperLU, multigrid_installed
 from dpl.fem.linear.interface import UNKNOWN, UNSTABLE, Stability
@@ -20,11 +22,6 @@ from dpl.fem.solvers import factor_reuse as reuse_module
 from dpl.fem.solvers.factor_reuse import Preconditioner, select_preconditioner
 
 NH, SVK = fem.NeoHookeanLn(0.3), fem.SaintVenantKirchhoff(0.3)
-
-
-def load_of(*forces: Tensor) -> fem.Load:
-    """Return nodal forces (N, D) [-] as a batch of loads."""
-    return fem.Load(torch.stack(forces), torch.ones(len(forces), dtype=torch.float64))
 
 
 def pair(problem: fem.Problem, load: fem.Load, guess: Tensor | None = None, **options):
@@ -57,12 +54,6 @@ def check(every: fem.Solution, few: fem.Solution, *, steps: int = 1, fewer: bool
         assert (few.factorisations < every.factorisations).all()
 
 
-@pytest.fixture(params=[False, True], ids=["plain", "mixed"])
-def mixed(request) -> bool:
-    """Both kinds of Newton: without and with mixed integration points."""
-    return request.param
-
-
 @pytest.mark.parametrize(
     ("name", "q", "mixed"),
     [("neo_hookean_ln", q, mixed) for q in (1.0, 20.0, 80.0) for mixed in (False, True)]
@@ -70,7 +61,7 @@ def mixed(request) -> bool:
 )
 def test_solution_of_any_law_does_not_depend_on_reuse(beam, pull, name, q, mixed):
     problem = beam(LAWS[name])
-    every, few = pair(problem, load_of(pull(problem, q)[0]), mixed_integration=mixed)
+    every, few = pair(problem, load_of(pull(problem, q)), mixed_integration=mixed)
     assert every.converged.all()
     check(every, few, fewer=every.iterations.item() > 2)
 
@@ -81,7 +72,7 @@ def test_solution_on_any_element_does_not_depend_on_reuse(grid, kind, size):
     mesh = grid(cell, 3, 0.2, inside=True)
     problem = fem.Problem.build(mesh, NH, fixed=fem.Plane(0, "min"), degree=degree)
     across = [0.0] * (mesh.dim() - 1) + [size]
-    every, few = pair(problem, load_of(fem.Traction(fem.Plane(0, "max"), across).on(problem)))
+    every, few = pair(problem, load_of(fem.Traction(fem.Plane(0, "max"), across).on(problem)[None]))
     assert every.converged.all()
     check(every, few)
 
@@ -90,7 +81,7 @@ def test_solution_on_any_element_does_not_depend_on_reuse(grid, kind, size):
 @pytest.mark.parametrize(("cells", "q"), [((8, 2), 160.0), ((16, 4), 40.0)])
 def test_solution_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cells, q):
     problem = beam(NH, *cells)
-    every, few = pair(problem, load_of(pull(problem, q)[0]), linear=name)
+    every, few = pair(problem, load_of(pull(problem, q)), linear=name)
     assert every.converged.all()
     check(every, few, fewer=name != "cg" or multigrid_installed())  # the diagonal spares none
 
@@ -98,7 +89,7 @@ def test_solution_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cell
 @pytest.mark.parametrize("q", [160.0, 400.0])
 def test_large_load_that_takes_steps_does_not_depend_on_reuse(beam, pull, mixed, q):
     problem = beam(NH)
-    load = load_of(pull(problem, q)[0])
+    load = load_of(pull(problem, q))
     states = list(
         fem.Newton(
             problem, linear="superlu", mixed_integration=mixed, factor_reuse_tol=0.0
@@ -113,7 +104,7 @@ def test_large_load_that_takes_steps_does_not_depend_on_reuse(beam, pull, mixed,
 def test_load_without_a_solution_has_none_with_reuse(beam, pull, mixed):
     problem = beam(SVK)
     options = {"min_load_step": 2.0**-6, "mixed_integration": mixed}
-    every, few = pair(problem, load_of(pull(problem, 400.0)[0]), **options)
+    every, few = pair(problem, load_of(pull(problem, 400.0)), **options)
     assert every.status.item() == few.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
     assert 0 < few.load_factor.item() < 1
     assert few.load_factor.item() == pytest.approx(every.load_factor.item(), abs=1e-9)
@@ -128,7 +119,7 @@ def test_moved_supports_are_followed_with_reuse(law, mixed):
     problem = fem.Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0)
     sideways = fem.Traction(fem.Plane(2, "max"), [0.0, 0.0, 0.01]).on(problem)
     for force in (torch.zeros_like(sideways), sideways):
-        every, few = pair(problem, load_of(force), mixed_integration=mixed)
+        every, few = pair(problem, load_of(force[None]), mixed_integration=mixed)
         assert every.converged.all()
         check(every, few)
 
@@ -138,7 +129,7 @@ def test_moved_supports_are_followed_with_reuse(law, mixed):
 )
 def test_guess_leads_to_the_same_solution_with_reuse(beam, pull, law, part):
     problem = beam(law)
-    load = load_of(pull(problem, 20.0)[0])
+    load = load_of(pull(problem, 20.0))
     answer = fem.solve(
         fem.Newton(problem, tol=1e-12, linear="superlu", factor_reuse_tol=0.0), load
     ).displacement
@@ -151,7 +142,7 @@ def test_guess_leads_to_the_same_solution_with_reuse(beam, pull, law, part):
 @pytest.mark.parametrize("reuse", [0.0, 1e-3, 0.1, 1.0, 1e6])
 def test_more_reuse_means_fewer_factors(beam, pull, reuse):
     problem = beam(NH, 16, 4)
-    load = load_of(pull(problem, 20.0)[0])
+    load = load_of(pull(problem, 20.0))
     counts = {0.0: 4, 1e-3: 3, 0.1: 2, 1.0: 2, 1e6: 1}
     answer = fem.solve(fem.Newton(problem, linear="superlu", factor_reuse_tol=reuse), load)
     assert answer.converged.all()
@@ -162,7 +153,7 @@ def test_more_reuse_means_fewer_factors(beam, pull, reuse):
 @pytest.mark.parametrize("q", [5.0, 40.0, 160.0])
 def test_factorisations_are_counted(beam, pull, counted, q):
     problem = beam(NH)
-    solver, load = fem.Newton(problem, linear="superlu"), load_of(pull(problem, q)[0])
+    solver, load = fem.Newton(problem, linear="superlu"), load_of(pull(problem, q))
     solver.linear_solver.factor  # noqa: B018  the scene's
     counted.clear()
     answer = fem.solve(solver, load)
@@ -175,7 +166,7 @@ def test_without_reuse_every_tangent_is_factorised(beam, pull, monkeypatch):
     problem = beam(NH)
     monkeypatch.setattr(SuperLUFactor, "apply", None)
     answer = fem.solve(
-        fem.Newton(problem, linear="superlu", factor_reuse_tol=0.0), load_of(pull(problem, 40.0)[0])
+        fem.Newton(problem, linear="superlu", factor_reuse_tol=0.0), load_of(pull(problem, 40.0))
     )
     assert answer.converged.all()
     assert answer.factorisations.item() == answer.iterations.item() - 1
@@ -186,7 +177,7 @@ def test_factors_are_reused_only_below_factor_reuse_tol(beam, pull, reuse):
     problem = beam(NH)
     solver = fem.Newton(problem, linear="superlu", factor_reuse_tol=reuse)
     made, before = [], 1.0
-    for state in solver.iterate(load_of(pull(problem, 80.0)[0])):
+    for state in solver.iterate(load_of(pull(problem, 80.0))):
         made.append((before, state.factorisations.item()))
         before = state.residual.item()
     new = [b - a for (_, a), (_, b) in pairwise(made)]
@@ -200,7 +191,7 @@ def test_poor_preconditioner_is_replaced_after_the_largest_number_of_steps(
 ):
     """It costs a few products; iterations and solution are the same."""
     problem = beam(NH)
-    load = load_of(pull(problem, 40.0)[0])
+    load = load_of(pull(problem, 40.0))
     every, few = pair(problem, load)
     steps = []
     original = reuse_module.conjugate_gradients
@@ -220,7 +211,7 @@ def test_poor_preconditioner_is_replaced_after_the_largest_number_of_steps(
 
 def test_factor_that_cannot_be_applied_is_replaced(beam, pull, monkeypatch):
     problem = beam(NH)
-    load = load_of(pull(problem, 40.0)[0])
+    load = load_of(pull(problem, 40.0))
     every, _ = pair(problem, load)
 
     def fail(self, right):
@@ -234,11 +225,11 @@ def test_factor_that_cannot_be_applied_is_replaced(beam, pull, monkeypatch):
 
 def test_batch_with_reuse_solves_like_its_members(beam, pull):
     problem = beam(NH)
-    load = load_of(*(pull(problem, q)[0] for q in (0.0, 1e-6, 5.0, 40.0, 160.0)))
+    load = load_of(torch.cat([pull(problem, q) for q in (0.0, 1e-6, 5.0, 40.0, 160.0)]))
     solver = fem.Newton(problem, linear="superlu")
     batch = fem.solve(solver, load)
     for k, force in enumerate(load.force):
-        alone = fem.solve(solver, load_of(force))
+        alone = fem.solve(solver, load_of(force[None]))
         for name in ("displacement", "iterations", "factorisations", "status"):
             assert torch.equal(getattr(batch, name)[k], getattr(alone, name)[0]), name
     assert len(set(batch.factorisations.tolist())) > 2
@@ -253,7 +244,7 @@ def test_factorisations_of_a_batch_are_all_counted(beam, pull, monkeypatch):
         return original(self, matrix)
 
     problem = beam(NH)
-    load = load_of(*(pull(problem, q)[0] for q in (5.0, 10.0, 20.0, 40.0)))
+    load = load_of(torch.cat([pull(problem, q) for q in (5.0, 10.0, 20.0, 40.0)]))
     solver = fem.Newton(problem, linear="pardiso")
     solver.linear_solver.factor  # noqa: B018
     monkeypatch.setattr(Pardiso, "_factorise", count)
@@ -273,7 +264,7 @@ def test_the_next_factor_takes_the_storage_of_an_unused_one(beam, pull, monkeypa
     solver = fem.Newton(problem, linear="band", factor_reuse_tol=reuse)
     solver.linear_solver.factor  # noqa: B018
     monkeypatch.setattr(BandedCholesky, "_cholesky", watched)
-    answer = fem.solve(solver, load_of(pull(problem, 40.0)[0]))
+    answer = fem.solve(solver, load_of(pull(problem, 40.0)))
     assert answer.factorisations.item() == len(places) >= 3
     assert len(set(places)) == 1
 
@@ -281,34 +272,11 @@ def test_the_next_factor_takes_the_storage_of_an_unused_one(beam, pull, monkeypa
 # ---- stability
 
 
-@cache
-def column(law: fem.Material) -> tuple[fem.Problem, Tensor]:
-    """Return a column of 10 x 1 x 1 m, E = 1000 Pa, and the axial load P = 1."""
-    mesh = fem.box([10.0, 1.0, 1.0], [11, 2, 2])
-    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=2)
-    return problem, fem.Traction(fem.Plane(0, "max"), [-1 / 1000, 0.0, 0.0]).on(problem)
-
-
-@cache
-def cube(poisson: float) -> tuple[fem.Problem, Tensor]:
-    """Return the cube of Rivlin (1948) on three symmetry planes, and T = 1 on the other faces."""
-    mesh = fem.box([1.0, 1.0, 1.0], [2, 2, 2])
-    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(poisson), fixed=mesh.p.T == 0, length=1.0)
-    normals = torch.eye(3).tolist()
-    return problem, sum(fem.Traction(fem.Plane(i, "max"), normals[i]).on(problem) for i in range(3))
-
-
-def negative(problem: fem.Problem, displacement: Tensor) -> int:
-    """Return the number of negative eigenvalues of K at a displacement (1, N, D)."""
-    tangent = problem.linearise(displacement).tangent[0].numpy()
-    return SuperLU(problem.pattern).factorise(tangent).negative_pivots
-
-
 BODIES = {  # body with its unit load, critical load (independent code)
-    "SVK column": (partial(column, fem.SaintVenantKirchhoff(0.0)), 2.039763),
-    "NH column": (partial(column, fem.NeoHookeanLn(0.0)), 2.056558),
-    "cube, nu = .45": (partial(cube, 0.45), 0.7475041023),
-    "cube, nu = .49": (partial(cube, 0.49), 0.6804639956),
+    "SVK column": (partial(column, fem.SaintVenantKirchhoff(0.0), (10, 1, 1)), 2.039763),
+    "NH column": (partial(column, fem.NeoHookeanLn(0.0), (10, 1, 1)), 2.056558),
+    "cube, nu = .45": (partial(cube, fem.NeoHookeanLn(0.45), 1, (0, 1, 2)), 0.7475041023),
+    "cube, nu = .49": (partial(cube, fem.NeoHookeanLn(0.49), 1, (0, 1, 2)), 0.6804639956),
 }
 BEYOND = (1.0005, 1.002, 1.05)
 
@@ -317,9 +285,9 @@ BEYOND = (1.0005, 1.002, 1.05)
 @pytest.mark.parametrize(
     ("name", "part", "linear", "reuse"),
     [
-        (name, part, "superlu", (0.0, 0.1, 1.0)[(row + column) % 3])
+        (name, part, "superlu", (0.0, 0.1, 1.0)[(row + number) % 3])
         for row, name in enumerate(BODIES)
-        for column, part in enumerate(BEYOND)
+        for number, part in enumerate(BEYOND)
     ]
     + [
         ("SVK column", 1.001, linear, reuse)
@@ -335,9 +303,9 @@ def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, l
         {"tol": 1e-10, "linear": linear, "factor_reuse_tol": reuse},
     )
     problem, unit = build()
-    answer = fem.solve(fem.Newton(problem, **options), load_of(part * critical * unit))
+    answer = fem.solve(fem.Newton(problem, **options), load_of(part * critical * unit[None]))
     assert answer.converged.all()
-    assert negative(problem, answer.displacement) == 2
+    assert inertia(problem, answer.displacement) == 2
     assert answer.status.item() == fem.Status.UNSTABLE
     assert answer.negative_pivots.item() == 2
 
@@ -347,8 +315,8 @@ def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, l
 def test_load_below_a_critical_one_is_stable_whatever_is_reused(name):
     build, critical = BODIES[name]
     problem, unit = build()
-    every, few = pair(problem, load_of(0.999 * critical * unit), tol=1e-10)
-    assert negative(problem, few.displacement) == 0
+    every, few = pair(problem, load_of(0.999 * critical * unit[None]), tol=1e-10)
+    assert inertia(problem, few.displacement) == 0
     assert few.status.item() == fem.Status.CONVERGED
     check(every, few, fewer=False)
 
@@ -356,7 +324,7 @@ def test_load_below_a_critical_one_is_stable_whatever_is_reused(name):
 @pytest.mark.parametrize(("P", "linear"), [(2.1, "superlu"), (2.5, "band"), (4.0, "superlu")])
 def test_factor_with_negative_pivots_is_never_reused(monkeypatch, P, linear):
     """Conjugate gradients need a positive definite preconditioner."""
-    problem, unit = column(fem.SaintVenantKirchhoff(0.0))
+    problem, unit = BODIES["SVK column"][0]()
     used, met, original = [], [], SuperLU.factorise
 
     def watched(self, values):
@@ -370,16 +338,16 @@ def test_factor_with_negative_pivots_is_never_reused(monkeypatch, P, linear):
         SuperLUFactor, "apply", lambda self, r: used.append(self.negative_pivots) or self.solve(r)
     )
     solver = fem.Newton(problem, tol=1e-10, linear=linear, factor_reuse_tol=1e6)
-    answer = fem.solve(solver, load_of(P * unit))
+    answer = fem.solve(solver, load_of(P * unit[None]))
     assert answer.status.item() == fem.Status.UNSTABLE
     assert [count for count in met if count > 0][:2] == [2, 2]
     assert not any(used)
 
 
 def test_straight_column_far_beyond_is_the_same_with_and_without_reuse():
-    problem, unit = column(fem.SaintVenantKirchhoff(0.0))
+    problem, unit = BODIES["SVK column"][0]()
     for P in (2.1, 2.5, 4.0):
-        every, few = pair(problem, load_of(P * unit), tol=1e-10)
+        every, few = pair(problem, load_of(P * unit[None]), tol=1e-10)
         assert few.status.item() == every.status.item() == fem.Status.UNSTABLE
         assert few.negative_pivots.item() == every.negative_pivots.item()
         check(every, few, fewer=False)

@@ -230,16 +230,6 @@ def test_surfaces_may_be_regions_in_metres():
     assert_close(frames_on(wall(**regions), mesh), frames_on(wall(), mesh), rtol=0, atol=1e-12)
 
 
-def test_angle_is_zero_for_circumferential_fibres():
-    mesh = quarter_cylinder(4)
-    frames = frames_on(wall(inner_angle=0.0, outer_angle=0.0), mesh)
-    np.testing.assert_allclose(frames[:, :, 0], polar(mesh)[2], atol=0.04)
-    frames = frames_on(wall(inner_angle=math.pi / 2, outer_angle=math.pi / 2), mesh)
-    np.testing.assert_allclose(
-        frames[:, :, 0], np.tile([0.0, 0.0, 1.0], (len(frames), 1)), atol=1e-12
-    )
-
-
 # ------------------------------------------------------------------ errors
 
 

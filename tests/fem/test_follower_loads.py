@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.optimize import fsolve
 from scipy.sparse import tril, triu
+from solving import load_of, rest, sliding
 from torch.testing import assert_close
 
 from benchmarks.verification.pressurised import (
@@ -40,12 +41,8 @@ def first_half(points):
     return points[:, 0] < 0.5
 
 
-def no_load(problem):
-    return fem.Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
-
-
 def solved(newton):
-    return fem.solve(newton, no_load(newton.problem))
+    return fem.solve(newton, load_of(rest(newton.problem)))
 
 
 def swirl(points):
@@ -117,9 +114,7 @@ def test_forces_rotate_with_the_body(bent):
     _, problem, u = bent
     dim = problem.shape[1]
     Q = torch.linalg.qr(torch.from_numpy(np.random.default_rng(1).normal(size=(dim, dim))))[0]
-    Q = Q * torch.linalg.det(Q)  # a rotation in 3D; the sign is corrected in 2D below
-    if torch.linalg.det(Q) < 0:
-        Q = torch.stack([-Q[:, 0], *Q.T[1:]], dim=1)
+    Q[:, 0] *= torch.linalg.det(Q)  # a rotation
     turned = ((problem.points + u) @ Q.T) - problem.points
     force = problem.follower_loads.force(u) @ Q.T
     assert_close(problem.follower_loads.force(turned), force, rtol=1e-12, atol=1e-14)
@@ -129,9 +124,9 @@ def test_linear_solution_is_that_of_the_forces_at_rest(bent):
     """K(0) excludes the stiffness of follower loads."""
     _, problem, _ = bent
     elastic = replace(problem, follower_loads=NO_LOADS)
-    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    assert_close(problem.stiffness_at_rest(), elastic.tangent(rest)[0], rtol=1e-9, atol=1e-12)
-    assert (problem.tangent(rest)[0] - problem.stiffness_at_rest()).abs().max() > 1e-3
+    zero = rest(problem)
+    assert_close(problem.stiffness_at_rest(), elastic.tangent(zero)[0], rtol=1e-9, atol=1e-12)
+    assert (problem.tangent(zero)[0] - problem.stiffness_at_rest()).abs().max() > 1e-3
 
 
 def test_force_of_an_active_stress_is_affine(grid, bend):
@@ -194,10 +189,9 @@ def above(p):
     return fem.FollowerPressure(TOP, p)
 
 
-@pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
 def test_newton_converges_quadratically_without_a_potential(beam, mixed):
     newton = fem.Newton(beam(above(2e-3)), tol=1e-12, mixed_integration=mixed)
-    residuals = [float(s.residual) for s in newton.iterate(no_load(newton.problem))]
+    residuals = [float(s.residual) for s in newton.iterate(load_of(rest(newton.problem)))]
     assert residuals[-1] < 1e-12
     assert residuals[0] == 1.0
     assert len(residuals) <= 8
@@ -242,7 +236,7 @@ def test_half_the_stress_is_half_the_load_factor(beam, load):
 def test_residual_is_relative_to_the_forces_at_rest(beam, load, value):
     """With no other force ||R||/||f|| is 1 at rest and does not depend on the unit of stress."""
     problem = beam(replace(load, value=value))
-    nothing = no_load(problem).force
+    nothing = rest(problem)
     assert float(problem.relative_residual(nothing, nothing)) == pytest.approx(1.0, rel=1e-14)
 
 
@@ -258,7 +252,7 @@ def test_active_stress_pressure_and_dead_load_act_together(beam):
     both, first, second, none = tangents
     assert_close(both - none, first + second - 2 * none, rtol=1e-9, atol=1e-13)
     force = fem.Traction(END, [0.0, 0.0, 1e-3]).on(problem)[None]
-    found = fem.solve(fem.Newton(problem), fem.Load(force, torch.ones(1)))
+    found = fem.solve(fem.Newton(problem), load_of(force))
     assert found.converged.all()
     residual = problem.residual(found.displacement, force)
     scale = max(problem.acting(f).norm() for f in (force, problem.force_at_rest))
@@ -367,7 +361,7 @@ def test_reduced_solvers_refuse_follower_loads(beam, load):
 
 def test_potential_energy_needs_a_potential(beam):
     problem = beam(above(1e-3))
-    load = no_load(problem)
+    load = load_of(rest(problem))
     with pytest.raises(ValueError, match="has no potential"):
         potential_energy(load.force, load, problem, RestStiffness(problem))
 
@@ -392,19 +386,17 @@ def test_a_free_block_shortens_as_the_closed_form(cell, tension, grid):
         )
 
     a, b = fsolve(stresses, [0.9, 1.05], xtol=1e-14)
-    planes = [  # allow any stretch along the axes
-        fem.DirichletBC(fem.Plane(axis, "min"), [0.0 if i == axis else None for i in range(dim)])
-        for axis in range(dim)
-    ]
     muscle = fem.ActiveStress(tension, directions=ALONG_X)
-    problem = fem.Problem.build(mesh, NH, supports=planes, follower_loads=[muscle], length=1.0)
+    problem = fem.Problem.build(
+        mesh, NH, supports=sliding(dim), follower_loads=[muscle], length=1.0
+    )
     newton = fem.Newton(problem, tol=1e-12)
     found = solved(newton)
     assert found.converged.all()
     stretches = torch.tensor([a, *[b] * (dim - 1)]).double()
     moved = problem.points + found.displacement[0]
     assert_close(moved, problem.points * stretches, rtol=0, atol=1e-10)
-    linear = newton.linear_solver.solve(no_load(problem).force[0])
+    linear = newton.linear_solver.solve(rest(problem)[0])
     shortening = tension * (1 - (NH.poisson**2 if dim == 2 else 0.0))  # Hooke, E = 1
     assert float(linear[:, 0].abs().max()) == pytest.approx(abs(shortening), rel=1e-10)
 
@@ -423,8 +415,7 @@ def test_a_rotated_body_with_rotated_fibres_and_load_has_the_rotated_solution():
             turned, NH, fixed=mesh.p[0] < 1e-9, follower_loads=[muscle], length=1.0
         )
         force = torch.from_numpy(np.tile(rotation @ pull, (problem.shape[0], 1)))[None]
-        load = fem.Load(force, torch.ones(1))
-        return fem.solve(fem.Newton(problem, tol=1e-11), load).displacement[0]
+        return fem.solve(fem.Newton(problem, tol=1e-11), load_of(force)).displacement[0]
 
     usual, turned = answer(np.eye(3)), answer(Q)
     assert usual.abs().max() > 0.02
@@ -434,12 +425,8 @@ def test_a_rotated_body_with_rotated_fibres_and_load_has_the_rotated_solution():
 def test_pressure_beyond_the_limit_point_has_no_valid_equilibrium():
     """A neo-Hookean sphere or cylinder has a largest internal pressure."""
     mesh, load = sector(2, 1, "quad", quadratic=True), fem.FollowerPressure(inner_surface, 0.6)
-    planes = [
-        fem.DirichletBC(fem.Plane(axis, "min"), [0.0 if i == axis else None for i in range(2)])
-        for axis in range(2)
-    ]
     problem = fem.Problem.build(
-        mesh, NH, degree=2, supports=planes, follower_loads=[load], length=1.0
+        mesh, NH, degree=2, supports=sliding(2), follower_loads=[load], length=1.0
     )
     found = solved(fem.Newton(problem, min_load_step=2.0**-5))
     assert int(found.status) == fem.Status.NO_VALID_EQUILIBRIUM

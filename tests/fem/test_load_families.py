@@ -477,11 +477,7 @@ def test_a_fixed_region_is_refused_in_one_line(build, linear, name):
         ("cable", {"tension": (1.0, math.nan)}, "tension = [1.0, nan] must be"),
         ("cable", {"cables": []}, "cables = [] must contain a cable"),
         ("cable", {"cables": [[[0.0, 0.0, 0.0]]]}, "cables.0 = [[0.0, 0.0, 0.0]] must be two or"),
-        (
-            "cable",
-            {"cables": [[[0, 0], [1, 1]]]},
-            "cables.0 = [[0, 0], [1, 1]] must be two or more",
-        ),
+        ("cable", {"cables": [[[0, 0], [1, 1]]]}, "cables.0 = [[0, 0], [1, 1]] must be two or"),
         ("cable", {"cables": [[[1, 1, 1], [1, 1, 1]]]}, "cables.0 must not contain the same point"),
         ("cable", {"cables": [CABLE[0], [[1, 1, 1], [1, 1, 99]]]}, "cables.1: the point [1.0, 1.0"),
         ("file", {"factor": (1.0,)}, "factor = [1.0] must be"),

@@ -377,23 +377,20 @@ def test_a_valid_file_is_read_without_a_warning(tmp_path):
             assert fem.read_mesh(path).nelements == len(cells)
 
 
-NUMBERS = {  # format: file, a node of it, the same with the number of another, words
-    "gmsh22": ("cube.msh", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
-    "gmsh": ("cube.msh", "\n4\n5\n", "\n3\n5\n", r"1 node numbers .* more than once: 3"),
-    "abaqus": ("cube.inp", "\n4, 0.0", "\n3, 0.0", r"1 node numbers .* more than once: 3"),
-    "permas": ("cube.dato", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
-    "avsucd": ("cube.avs", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
-    "nastran": (
-        *("cube.bdf", "BEGIN BULK\n", "BEGIN BULK\nGRID,3,,9.0,9.0,9.0\n"),
-        r"1 node numbers .* more than once: 3",
-    ),
+NUMBERS = {  # format: file, a node of it, the same with the number of another
+    "gmsh22": ("cube.msh", "\n4 0.0", "\n3 0.0"),
+    "gmsh": ("cube.msh", "\n4\n5\n", "\n3\n5\n"),
+    "abaqus": ("cube.inp", "\n4, 0.0", "\n3, 0.0"),
+    "permas": ("cube.dato", "\n4 0.0", "\n3 0.0"),
+    "avsucd": ("cube.avs", "\n4 0.0", "\n3 0.0"),
+    "nastran": ("cube.bdf", "BEGIN BULK\n", "BEGIN BULK\nGRID,3,,9.0,9.0,9.0\n"),
 }
 
 
 @pytest.mark.parametrize("kind", NUMBERS)
 def test_a_node_number_that_is_listed_twice_is_an_error_that_names_it(tmp_path, kind):
     """Meshio would use the last node of that number, wherever it is."""
-    name, own, other, reported = NUMBERS[kind]
+    name, own, other = NUMBERS[kind]
     path = tmp_path / name
     binary = {"binary": False} if kind.startswith("gmsh") else {}
     meshio.write(path, meshio.Mesh(CORNERS, [("tetra", TETS)]), file_format=kind, **binary)
@@ -401,7 +398,7 @@ def test_a_node_number_that_is_listed_twice_is_an_error_that_names_it(tmp_path, 
     text = path.read_text()
     assert text.count(own) == 1
     path.write_text(text.replace(own, other))
-    with pytest.raises(ValueError, match=reported) as error:
+    with pytest.raises(ValueError, match=r"1 node numbers .* more than once: 3") as error:
         fem.read_mesh(path)
     assert "\n" not in str(error.value)
 
@@ -606,18 +603,20 @@ def test_a_file_that_ends_too_early_is_an_error_and_meshio_keeps_silent(tmp_path
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize(
-    "mesh",
-    [
-        fem.box([2.0, 1.0, 1.0], [3, 2, 2]),
-        fem.box([2.0, 1.0, 1.0], [3, 2, 2], "tetra"),
-        fem.rectangle([2.0, 1.0], [3, 2]),
-        fem.rectangle([2.0, 1.0], [3, 2], "triangle"),
-        skfem.MeshTet2.from_mesh(fem.box([2.0, 1.0, 1.0], [3, 2, 2], "tetra")),
-        skfem.MeshHex2.from_mesh(fem.box([2.0, 1.0, 1.0], [3, 2, 2])),
-    ],
-    ids=lambda mesh: type(mesh).__name__,
-)
+EXACT = [
+    fem.box([2.0, 1.0, 1.0], [3, 2, 3]),
+    fem.box([2.0, 1.0, 1.0], [3, 2, 3], "tetra"),
+    fem.rectangle([2.0, 1.0], [3, 2]),
+    fem.rectangle([2.0, 1.0], [3, 2], "triangle"),
+    skfem.MeshTri2.from_mesh(fem.rectangle([2.0, 1.0], [3, 2], "triangle")),
+    skfem.MeshQuad2.from_mesh(fem.rectangle([2.0, 1.0], [3, 2])),
+    skfem.MeshTet2.from_mesh(fem.box([2.0, 1.0, 1.0], [3, 2, 3], "tetra")),
+    skfem.MeshHex2.from_mesh(fem.box([2.0, 1.0, 1.0], [3, 2, 3])),
+]
+SAVED = [mesh for mesh in EXACT if not isinstance(mesh, (skfem.MeshTri2, skfem.MeshQuad2))]
+
+
+@pytest.mark.parametrize("mesh", SAVED, ids=lambda mesh: type(mesh).__name__)
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk"])
 def test_save_and_load_give_the_mesh_and_its_fields_back(tmp_path, mesh, suffix):
     path = tmp_path / "new" / f"body{suffix}"
@@ -633,18 +632,6 @@ def test_save_and_load_give_the_mesh_and_its_fields_back(tmp_path, mesh, suffix)
     assert np.array_equal(data["displacement"][:vertices, :dim], vector[:vertices])
     assert not data["displacement"][:, dim:].any()
     assert np.array_equal(data["energy"][:vertices], scalar[:vertices])
-
-
-EXACT = [
-    fem.box([2.0, 1.0, 1.0], [3, 2, 3]),
-    fem.box([2.0, 1.0, 1.0], [3, 2, 3], "tetra"),
-    fem.rectangle([2.0, 1.0], [3, 2]),
-    fem.rectangle([2.0, 1.0], [3, 2], "triangle"),
-    skfem.MeshTri2.from_mesh(fem.rectangle([2.0, 1.0], [3, 2], "triangle")),
-    skfem.MeshQuad2.from_mesh(fem.rectangle([2.0, 1.0], [3, 2])),
-    skfem.MeshTet2.from_mesh(fem.box([2.0, 1.0, 1.0], [3, 2, 3], "tetra")),
-    skfem.MeshHex2.from_mesh(fem.box([2.0, 1.0, 1.0], [3, 2, 3])),
-]
 
 
 @pytest.mark.parametrize("mesh", EXACT, ids=lambda mesh: type(mesh).__name__)
@@ -670,19 +657,16 @@ def test_a_mesh_that_is_saved_exactly_is_loaded_to_the_last_bit(tmp_path, mesh):
 
 
 def test_the_propeller_s_nodes_have_one_order_on_all_processors():
-    """NumPy sorts ties in one way on AVX-512, in others on AVX2 and without both."""
+    """NumPy sorts ties in one way with AVX-512 or AVX2, in another without both."""
     program = (
         "import numpy as np; from dpl.fem import propeller; m = propeller();"
         "print(m.t.ravel()[:99].tolist(), np.round(m.p[:, :9], 9).tolist())"
     )
     mesh = fem.propeller()
     own = mesh.t.ravel()[:99].tolist(), np.round(mesh.p[:, :9], 9).tolist()
-    printed = {"{} {}\n".format(*own)}
-    for without in ("X86_V3", "X86_V4"):
-        environment = os.environ | {"NPY_DISABLE_CPU_FEATURES": without}
-        done = subprocess.run(
-            [sys.executable, "-W", "ignore", "-c", program],
-            capture_output=True, text=True, check=True, env=environment,
-        )  # fmt: skip
-        printed.add(done.stdout)
-    assert len(printed) == 1
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", program],
+        capture_output=True, text=True, check=True,
+        env=os.environ | {"NPY_DISABLE_CPU_FEATURES": "X86_V3"},
+    )  # fmt: skip
+    assert done.stdout == "{} {}\n".format(*own)

@@ -72,7 +72,9 @@ VTK = "# vtk DataFile Version 4.2\nx\nASCII\nDATASET "
 GMSH2, GMSH4 = (f"$MeshFormat\n{version} 0 8\n$EndMeshFormat\n" for version in ("2.2", "4.1"))
 BINARY = b"$MeshFormat\n4.1 1 8\n" + struct.pack("i", 1) + b"\n$EndMeshFormat\n$Nodes\n"
 ENDLESS = "more memory|ends too early|longer than"
-HOSTILE = [  # suffix, content, message
+IN_PROCESS = pytest.mark.usefixtures("in_process")  # where a check refuses, before meshio reads
+DAMAGED = "cannot be read as a mesh"
+FORBIDDEN = [  # suffix, content, message
     *[
         (suffix, f'<?xml version="1.0" encoding="{code}"?>{text}<VTKFile>x</VTKFile>'.encode(code),
          "document type or entities")
@@ -81,33 +83,46 @@ HOSTILE = [  # suffix, content, message
             *(("xdmf", LAUGHS, "utf-16"), ("xmf", OUTSIDE, "utf-8"), ("xml", LAUGHS, "utf-8")),
         )
     ],
-    ("vtu", DEEP, "cannot be read as a mesh"),
-    ("vtu", DEEP + "</a>" * 10**5 + "</VTKFile>", "cannot be read as a mesh"),
     # files of HDF5 can hold links to others
     *[(suffix, HDF, "h5py|netCDF4") for suffix in ("h5m", "med", "cgns", "hmf", "e")],
-    ("xdmf", XDMF, "h5py|netCDF4"),
     # counts beyond the size of the file
     ("msh", GMSH2 + "$Nodes\n999999999999\n", "must hold one section"),
-    ("msh", GMSH2 + "$Nodes\n1000000\n1 0 0 0\n$EndNodes\n", "cannot be read as a mesh"),
     ("msh", GMSH4 + "$Nodes\n1 999999999999 1 1\n", "must hold one section"),
     ("msh", GMSH2 + "$Elements\n999999999999\n", "must hold one section"),
     ("msh", BINARY + struct.pack("4Q", 1, 10**12, 1, 10**12), "must hold one section"),
-    ("vtk", VTK + "UNSTRUCTURED_GRID\nPOINTS 99999999 double\n", "cannot be read as a mesh"),
-    ("vtk", VTK + "UNSTRUCTURED_GRID\nCELL_TYPES 99999 double\n", "cannot be read as a mesh"),
-    ("vtk", VTK + "STRUCTURED_POINTS\nDIMENSIONS 9999 9999 9999\n", "cannot be read as a mesh"),
+]  # fmt: skip
+HOSTILE = [
+    ("vtu", LAUGHS + "<VTKFile>x</VTKFile>", "document type or entities"),
+    ("vtu", DEEP, DAMAGED),
+    ("vtu", DEEP + "</a>" * 10**5 + "</VTKFile>", DAMAGED),
+    ("xdmf", XDMF, "h5py|netCDF4"),
+    ("msh", GMSH2 + "$Nodes\n1000000\n1 0 0 0\n$EndNodes\n", DAMAGED),
+    ("vtk", VTK + "UNSTRUCTURED_GRID\nPOINTS 99999999 double\n", DAMAGED),
+    ("vtk", VTK + "UNSTRUCTURED_GRID\nCELL_TYPES 99999 double\n", DAMAGED),
+    ("vtk", VTK + "STRUCTURED_POINTS\nDIMENSIONS 9999 9999 9999\n", DAMAGED),
     ("su2", "NDIME= 3\nNPOIN= 999999999999\n", "cannot be read|holds no supported cells"),
-    ("su2", "NDIME= 3\nNELEM= 999999999\n", "cannot be read|holds no supported cells"),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("suffix", "content", "match"), HOSTILE, ids=itertools.count())
-def test_hostile_files_are_refused(tmp_path, suffix, content, match):
+def check_content(tmp_path, suffix: str, content: str | bytes, match: str) -> None:
+    """Assert that a file of this content is refused."""
     path = tmp_path / f"hostile.{suffix}"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     refused(path, match)
 
 
-@pytest.mark.usefixtures("in_process")
+@pytest.mark.parametrize(("suffix", "content", "match"), HOSTILE, ids=itertools.count())
+def test_hostile_files_are_refused(tmp_path, suffix, content, match):
+    check_content(tmp_path, suffix, content, match)
+
+
+@IN_PROCESS
+@pytest.mark.parametrize(("suffix", "content", "match"), FORBIDDEN, ids=itertools.count())
+def test_files_with_forbidden_content_are_refused(tmp_path, suffix, content, match):
+    check_content(tmp_path, suffix, content, match)
+
+
+@IN_PROCESS
 @pytest.mark.parametrize(
     ("name", "options", "old", "new", "match"),
     [
@@ -130,7 +145,7 @@ def test_counts_that_contradict_the_content_are_refused(tmp_path, name, options,
     refused(replaced(cube(tmp_path, name, **options), old, new), match)
 
 
-@pytest.mark.usefixtures("in_process")
+@IN_PROCESS
 def test_dolfin_xml_is_refused(tmp_path):
     """Meshio leaves rows that such a file declares and does not list undefined."""
     path = tmp_path / "cube.xml"
@@ -159,15 +174,14 @@ GOOD = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["binary", "appended"])
-@pytest.mark.parametrize("compressor", ["vtkZLibDataCompressor", "vtkLZMADataCompressor"])
+@pytest.mark.parametrize(("compressor", "kind"), [("ZLib", "binary"), ("LZMA", "appended")])
 def test_data_that_unpack_beyond_the_memory_limit_are_refused(
     tmp_path, kind, compressor, monkeypatch
 ):
     monkeypatch.setattr(sandbox, "MEMORY", (2**28, 0))
-    squeeze = zlib.compress if "ZLib" in compressor else lzma.compress
+    squeeze = zlib.compress if compressor == "ZLib" else lzma.compress
     text = packed(bytes(100 * 2**20), blocks=3, squeeze=squeeze)
-    values = GOOD | {"compressor": compressor, "kind": kind, "here": text}
+    values = GOOD | {"compressor": f"vtk{compressor}DataCompressor", "kind": kind, "here": text}
     if kind == "appended":
         after = f'<AppendedData encoding="base64">_{text}</AppendedData>'
         values |= {"here": "", "after": after}
@@ -177,17 +191,27 @@ def test_data_that_unpack_beyond_the_memory_limit_are_refused(
     assert read_mesh(cube(tmp_path)).t.shape[0] == 4
 
 
-@pytest.mark.usefixtures("in_process")
+@IN_PROCESS
 def test_the_vtu_of_the_bombs_is_good_without_one(tmp_path):
     path = tmp_path / "good.vtu"
     path.write_text(VTU.format(**GOOD, here=packed(CORNERS.astype("<f8").tobytes())))
     assert read_mesh(path).nelements == 1
 
 
+def check_offsets(tmp_path, nodes: str, offsets: str, types: str) -> None:
+    """Assert that a cell of these numbers is refused."""
+    path = tmp_path / "bad.vtu"
+    here = packed(CORNERS.astype("<f8").tobytes())
+    path.write_text(
+        VTU.format(**(GOOD | {"nodes": nodes, "offsets": offsets, "types": types}), here=here)
+    )
+    refused(path, "types or the offsets of its cells|more memory|damaged")
+
+
+@IN_PROCESS
 @pytest.mark.parametrize(
     ("nodes", "offsets", "types"),
     [
-        ("0 1 2 3 4 5 6 7", "1000000000", "7"),  # a polygon of 10^9 nodes
         ("0 1 2 3 4 5 6 7", "7", "12"),
         ("0 1 2 3 4 5 6 7 7", "9", "12"),
         ("0 1 2 3 4 5 6 7", "8", "11"),  # a voxel, which meshio leaves out
@@ -195,12 +219,11 @@ def test_the_vtu_of_the_bombs_is_good_without_one(tmp_path):
     ],
 )
 def test_offsets_must_fit_the_cells(tmp_path, nodes, offsets, types):
-    path = tmp_path / "bad.vtu"
-    here = packed(CORNERS.astype("<f8").tobytes())
-    path.write_text(
-        VTU.format(**(GOOD | {"nodes": nodes, "offsets": offsets, "types": types}), here=here)
-    )
-    refused(path, "types or the offsets of its cells|more memory|damaged")
+    check_offsets(tmp_path, nodes, offsets, types)
+
+
+def test_a_polygon_of_a_thousand_million_nodes_is_refused(tmp_path):
+    check_offsets(tmp_path, "0 1 2 3 4 5 6 7", "1000000000", "7")
 
 
 @pytest.mark.parametrize("form", [{"data_format": "XML"}, {"data_format": "Binary"}])
@@ -222,10 +245,8 @@ def test_xdmf_is_refused(tmp_path, form):
         ("d.mesh", "MeshVersionFormatted 2\nDimension 3\nRidges\n99999999999\n", ENDLESS),
         # files without their end
         ("a.mdpa", "Begin Nodes\n", "longer than"),  # meshio looks for a node after the end
-        ("a.nas", "BEGIN BULK\n\n", "cannot be read"),
         ("a.ele", "\n", "cannot be read"),
         ("a.dat", 'TITLE = "x"\nVARIABLES = "X"\n', "cannot be read"),
-        ("a.msh", "(0 x)\n(10 (1 1 5 0 3)(\n", "cannot be read"),
     ],
 )  # fmt: skip
 def test_files_that_need_much_memory_or_time_are_refused(tmp_path, name, text, match, few_seconds):
@@ -306,6 +327,7 @@ def test_a_link_to_a_good_file_is_read(tmp_path):
     assert read_mesh(tmp_path / "link.vtu").t.shape[0] == 4
 
 
+@IN_PROCESS
 def test_a_path_from_the_working_folder_is_found(tmp_path, monkeypatch):
     cube(tmp_path)
     for folder in (tmp_path, tmp_path.parent):
@@ -313,7 +335,7 @@ def test_a_path_from_the_working_folder_is_found(tmp_path, monkeypatch):
         assert read_mesh((tmp_path / "cube.vtu").relative_to(folder)).t.shape[0] == 4
 
 
-@pytest.mark.usefixtures("in_process")
+@IN_PROCESS
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e200"])
 def test_planar_nodes_have_a_finite_third_coordinate(tmp_path, value):
     """No comparison with their distance from the plane holds of these."""
@@ -322,7 +344,7 @@ def test_planar_nodes_have_a_finite_third_coordinate(tmp_path, value):
     refused(write(tmp_path / "patch.vtu", points, triangle=FAN), "1 nodes are not finite.*: 2")
 
 
-@pytest.mark.usefixtures("in_process")
+@IN_PROCESS
 @pytest.mark.parametrize("value", [1e60, -1e308])
 def test_coordinates_whose_volumes_overflow_are_an_error(tmp_path, value, recwarn):
     points = TWO_CUBES.astype(float)
@@ -331,7 +353,7 @@ def test_coordinates_whose_volumes_overflow_are_an_error(tmp_path, value, recwar
     assert not recwarn
 
 
-@pytest.mark.usefixtures("in_process")
+@IN_PROCESS
 def test_elements_of_gmsh_have_the_length_of_their_type(tmp_path):
     """Meshio takes the last nodes of a row: a triangle of a quadrilateral."""
     mesh = rectangle([2.0, 1.0], [3, 2])
@@ -343,7 +365,7 @@ def test_elements_of_gmsh_have_the_length_of_their_type(tmp_path):
     refused(replaced(path, "\n1 3 ", "\n1 2 "), "length of its type")
 
 
-@pytest.mark.usefixtures("in_process")
+@IN_PROCESS
 def test_nodes_of_gmsh_count_from_one(tmp_path):
     """Zero would be the last one."""
     path = cube(tmp_path, "a.msh", file_format="gmsh22", binary=False)
@@ -354,7 +376,7 @@ def test_nodes_of_gmsh_count_from_one(tmp_path):
     refused(path, "node 0, nodes count from 1")
 
 
-@pytest.mark.usefixtures("in_process")
+@IN_PROCESS
 @pytest.mark.parametrize(("kind", "nodes"), [("wedge", 6), ("pyramid", 5), ("hexahedron20", 20)])
 def test_solid_cells_of_other_kinds_are_not_left_out(tmp_path, kind, nodes):
     """A body of hexahedra and wedges would have holes."""
@@ -362,6 +384,7 @@ def test_solid_cells_of_other_kinds_are_not_left_out(tmp_path, kind, nodes):
     refused(write(tmp_path / "mixed.vtu", TWO_CUBES, **cells), "mixes hexahedron")
 
 
+@IN_PROCESS
 def test_many_nodes_in_one_place_are_told_without_listing_their_pairs(tmp_path):
     """30,000 cubes in one place have 3.6 * 10^9 pairs of nodes."""
     number = 30_000

@@ -8,6 +8,7 @@ from itertools import pairwise, product
 
 import pytest
 import torch
+from solving import LENGTH, load_of, rest
 from torch.testing import assert_close
 
 from dpl import fem
@@ -16,12 +17,6 @@ from dpl.fem.linear.banded import BandedCholesky
 from dpl.fem.solvers.factor_reuse import forcing_term
 
 SVK, NH = fem.SaintVenantKirchhoff(0.3), fem.NeoHookeanLn(0.3)
-LENGTH = 100.0  # of the paper's beam [m]
-
-
-def load_of(force: torch.Tensor) -> fem.Load:
-    """Return a load of the beam's stiffness."""
-    return fem.Load(force, torch.full((len(force),), 4500.0))
 
 
 def newton(problem: fem.Problem, **options) -> fem.Newton:
@@ -33,12 +28,6 @@ def differing(one: fem.Solution, other: fem.Solution) -> list[str]:
     """Return in what two solutions differ, if only by a bit; the time they took does not count."""
     pairs = zip(fem.Solution._fields, one, other, strict=True)
     return [name for name, a, b in pairs if name != "seconds" and not torch.equal(a, b)]
-
-
-@pytest.fixture(params=[False, True], ids=["plain", "mixed"])
-def mixed(request) -> bool:
-    """Both kinds of Newton: without and with mixed integration points."""
-    return request.param
 
 
 # The paper's beam: law, cells, degree, q [Pa], u_z, u_x of the corner [m], iterations
@@ -140,27 +129,11 @@ def test_one_step_squares_the_error(beam, pull):
     assert [(a / b).item() for a, b in pairwise(left)] == pytest.approx([2.0, 2.0], rel=0.02)
 
 
-def test_tiny_loads_converge_to_the_linear_answer(law, beam, pull, corner):
-    """Stress case T6: u / q is constant; the deviation is linear in q."""
-    problem, loads, deviations = beam(law), (1e-2, 1e-4, 1e-6), []
-    for q in loads:
-        load = load_of(pull(problem, q))
-        answer = fem.solve(newton(problem), load)
-        linear = fem.solve(fem.LinearSolver(problem, linear="superlu"), load)
-        assert answer.converged.all()
-        assert answer.iterations.item() <= 2
-        ratio = corner(problem, answer.displacement)[2] / corner(problem, linear.displacement)[2]
-        deviations.append(abs(ratio.item() - 1))
-    assert deviations[1] < 1e-6
-    assert deviations[0] / loads[0] == pytest.approx(deviations[1] / loads[1], rel=0.01)
-    assert deviations[1] / loads[1] == pytest.approx(deviations[2] / loads[2], rel=0.01)
-
-
 def test_no_load_costs_nothing(beam, monkeypatch):
     """Stress case T6: zero load, u = 0, 0 iterations, no factor."""
     problem = beam(NH)
     monkeypatch.setattr(SuperLU, "factorise", None)
-    states = list(newton(problem).iterate(load_of(torch.zeros(1, *problem.shape).double())))
+    states = list(newton(problem).iterate(load_of(rest(problem))))
     assert len(states) == 1
     assert not states[0].displacement.any()
     assert states[0].converged.all()
@@ -184,23 +157,6 @@ def test_a_load_step_is_at_most_twice_the_one_before(most):
     assert factors[-1] == 1
     whole = fem.solve(newton(problem), load_of(force))
     assert_close(states[-1].displacement, whole.displacement, rtol=0, atol=1e-6)
-
-
-def test_squeezed_block_fails_where_its_law_softens(mixed):
-    """An SVK bar has a solution up to |P| = E / (3 sqrt 3), and none beyond (closed form)."""
-    mesh = fem.box([1.0, 1.0, 1.0], [2, 2, 2])
-    slides = mesh.p.T == 0  # each coordinate plane holds its own normal
-    problem = fem.Problem.build(mesh, SVK, fixed=slides, length=1.0)
-    force = torch.zeros(1, 8, 3, dtype=torch.float64)
-    force[0, torch.from_numpy(mesh.p[0] == 1), 0] = -1 / 4
-    limit = 1 / (3 * math.sqrt(3))
-    below = fem.solve(newton(problem, mixed_integration=mixed), load_of(0.99 * limit * force))
-    assert below.converged.all()
-    assert below.displacement[0, :, 0].min().item() + 1 > 1 / math.sqrt(3)
-    above = fem.solve(newton(problem, mixed_integration=mixed), load_of(1.05 * limit * force))
-    assert not above.converged.any()
-    assert above.volume_ratio.item() > 0
-    assert above.load_factor.item() == pytest.approx(1 / 1.05, abs=0.02)
 
 
 def test_batch_solves_like_its_members(beam, pull):
@@ -546,8 +502,8 @@ def test_a_guess_with_an_indefinite_tangent_is_abandoned_if_wanted(linear, monke
         fem.box([4.0, 1.0, 1.0], [9, 3, 3]), fem.NeoHookeanLn(0.3), fixed=fem.Plane(0, "min")
     )
     force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, 1e-3]).on(problem)
-    load = fem.Load(force[None], torch.ones(1, dtype=torch.float64))
-    guess = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    load = load_of(force[None])
+    guess = rest(problem)
     guess[..., 0] = -0.4 * (problem.points[:, 0] - problem.points[:, 0].min())
     exact = fem.solve(fem.Newton(problem, linear=linear), load)
     newton = fem.Newton(problem, linear=linear, abandon_indefinite_guess=True)

@@ -5,49 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from solving import noise, rest
 from torch.testing import assert_close
 
-from dpl.fem import (
-    LinearElastic,
-    LinearSolver,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Problem,
-    solve,
-)
+from dpl import fem
 from dpl.fem.rom.ecsw import cubature, nonnegative
 from dpl.fem.rom.pod import pod
 
-NH = NeoHookeanLn(0.3)
 
-
-def reduced(problem: Problem, fields: torch.Tensor, rank: int) -> tuple[torch.Tensor, ...]:
+def reduced(problem: fem.Problem, fields: torch.Tensor, rank: int) -> tuple[torch.Tensor, ...]:
     """Return an orthonormal basis of fields (S, N, D), (N, D, R), and their projections onto it."""
     basis = pod(fields[:, problem.free], rank).vectors
     vectors = torch.zeros(*problem.shape, rank, dtype=torch.float64)
     vectors[problem.free] = basis
     return vectors, torch.einsum("bnd,ndr,mer->bme", fields, vectors, vectors)
-
-
-def noise(*shape: int, seed: int = 0) -> torch.Tensor:
-    """Return random numbers."""
-    random = torch.Generator().manual_seed(seed)
-    return torch.randn(*shape, generator=random, dtype=torch.float64)
-
-
-@pytest.fixture(scope="module")
-def newton(beam) -> Newton:
-    """The beam's reference solver."""
-    return Newton(beam(NH), linear="superlu", tol=1e-10)
-
-
-@pytest.fixture(scope="module")
-def snapshots(newton) -> torch.Tensor:
-    """Solutions for sixty random loads of three modes, deflections of up to 0.4 L."""
-    return solve(
-        newton, ModalLoads(newton.linear_solver, n_modes=3).sample(0, range(60))
-    ).displacement
 
 
 @pytest.mark.parametrize("shape", [(7, 40), (40, 7), (12, 12)], ids=str)
@@ -144,8 +115,8 @@ def test_few_positive_weights_reproduce_the_forces_of_snapshots(newton, snapshot
     ):
         of_cells = problem.dV.expand(32, -1) * weights.double()[:, None]
         body = replace(problem, dN=problem.dN.expand(32, -1, -1, -1).contiguous(), dV=of_cells)
-        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-        linear = torch.cat([body.tangent_product(rest, u[None]) for u in states])
+        zero = rest(problem)
+        linear = torch.cat([body.tangent_product(zero, u[None]) for u in states])
         forces.append(torch.einsum("bnd,ndr->br", body.internal_force(states) - linear, V))
     whole = torch.einsum("bnd,ndr->br", problem.internal_force(states), V).norm(dim=1)
     error = (forces[1] - forces[0]).norm(dim=1) / whole
@@ -153,9 +124,9 @@ def test_few_positive_weights_reproduce_the_forces_of_snapshots(newton, snapshot
 
 
 def test_a_linear_law_needs_no_cells(beam, pull):
-    problem = beam(LinearElastic(0.3), 4, 1)
-    rest = LinearSolver(problem, linear="superlu")
-    fields = torch.stack([rest.solve(pull(problem, q)[0]) for q in (1.0, 2.0)])
+    problem = beam(fem.LinearElastic(0.3), 4, 1)
+    linear = fem.LinearSolver(problem, linear="superlu")
+    fields = torch.stack([linear.solve(pull(problem, q)[0]) for q in (1.0, 2.0)])
     assert len(cubature(problem, *reduced(problem, fields, 1), 1e-3).cells) == 1
 
 

@@ -92,20 +92,6 @@ def test_quantiles_rise_and_stay_in_range(name):
     assert values[-1] <= high
 
 
-@pytest.mark.parametrize("low", [1e-2, 1e-4, 1e-6])
-def test_every_decade_holds_as_many_logarithmic_numbers(low):
-    decades = round(-np.log10(low))
-    counts, _ = np.histogram(np.log10(logarithmic(GRID, low)), decades, (-decades, 0))
-    assert counts.tolist() == pytest.approx([len(GRID) / decades] * decades, abs=2)
-
-
-@pytest.mark.parametrize("part", [0.1, 0.25, 0.9])
-def test_tail_makes_that_part_of_the_draws_small(part):
-    values = log_tail_mixture(GRID, part, 1e-3)
-    assert (values < 1).mean() == pytest.approx(part, abs=2e-4)
-    assert (values < 1e-3 * 1e3**0.5).mean() == pytest.approx(part / 2, abs=2e-4)
-
-
 def test_one_is_one():
     assert np.array_equal(constant(GRID), np.ones(len(GRID)))
 
@@ -136,14 +122,6 @@ def test_parameters_out_of_range_are_refused_by_name(quantile, name, value):
 
 
 # ---- points
-
-
-def test_points_lie_in_the_half_open_cube(drawn):
-    points = stream(drawn, 0, 512)
-    assert points.shape == (512, 3)
-    assert points.dtype == np.float64
-    assert (points >= 0).all()
-    assert (points < 1).all()
 
 
 def test_points_are_functions_of_seed_and_index(drawn):
@@ -205,8 +183,9 @@ def test_points_of_one_stream_are_no_nearer_to_those_of_another_than_by_chance(d
 def test_no_point_is_drawn_with_a_warning(drawn):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for index in (0, 1, 2, 3, 1000, 12_345):
+        for index in (*range(512), 1000, 12_345):
             point = drawn((0, 0), index, 9)
+            assert point.dtype == np.float64
             assert ((point > 0) & (point < 1)).all()
 
 

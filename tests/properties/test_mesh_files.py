@@ -195,7 +195,7 @@ def sound(mesh: skfem.Mesh) -> bool:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@at_most(0.5)
+@at_most(0.2)
 @given(cell=st.sampled_from(list(BODIES)), changes=st.lists(CHANGES, min_size=1, max_size=3))
 @counted
 def test_a_damaged_file_is_an_error_in_one_line_or_a_sound_mesh(

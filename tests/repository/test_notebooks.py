@@ -70,14 +70,21 @@ def test_a_notebook_links_to_what_is_there(path):
         assert (path.parent / target).is_file()
 
 
+# the one of the fewest laws, whose loops have to be compiled where no test has run before
+QUICK = next(path for path in NOTEBOOKS if path.stem == "2_loads_and_data")
+
+
 @pytest.mark.parametrize(
     "path",
-    [NOTEBOOKS[0], *(pytest.param(path, marks=pytest.mark.slow) for path in NOTEBOOKS[1:])],
+    [path if path == QUICK else pytest.param(path, marks=pytest.mark.slow) for path in NOTEBOOKS],
     ids=lambda path: path.stem,
 )
 @pytest.mark.timeout(1200)
 def test_a_notebook_runs_and_leaves_nothing_behind(path, tmp_path, monkeypatch, environment):
-    """Its assertions hold; it draws, warns of nothing and works outside the repository."""
+    """Its assertions hold; it draws, warns of nothing and works outside the repository.
+
+    One takes about 20 s of processor time; the others are slow tests. `make pictures` executes all.
+    """
     for name, value in environment().items():
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("MPLBACKEND")  # a kernel's own, which puts figures into the notebook
