@@ -10,6 +10,7 @@ from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
 MAX_LAYERS = 1000
+NEARLY_LINEAR = 0.7  # slope of negative inputs at the start of a network on the linear solution
 
 
 class FCNN(nn.Module):
@@ -71,9 +72,10 @@ class FCNN(nn.Module):
         self.register_buffer("outputs", outputs, persistent=False)
         for name, mask in {"input_index": read, "output_index": outputs}.items():
             self.register_buffer(name, mask.flatten().nonzero()[:, 0], persistent=False)
+        slope = NEARLY_LINEAR if inputs.is_displacement else 0.25
         stages: list[nn.Module] = [nn.Linear(sizes[0], sizes[1])]
         for before, after in pairwise(sizes[1:]):
-            stages += [nn.PReLU(before), nn.Linear(before, after)]
+            stages += [nn.PReLU(before, slope), nn.Linear(before, after)]
         self.stages = nn.Sequential(*stages)
 
     def forward(self, field: Tensor, scalars: Tensor) -> Tensor:

@@ -270,6 +270,17 @@ def test_residual_losses_are_the_formulas_of_their_terms(few, physics, near):
         assert found == pytest.approx(parts, rel=1e-12)
 
 
+def test_a_limit_keeps_one_rough_sample_from_dominating_a_batch(few, physics, near):
+    rough = torch.cat([300 * near[:1], near[1:]])
+    norms = residual_norm(rough, few, physics)
+    assert norms.max() > 100 * norms.median()
+    errors = RMSELoss(relative=1.0, floor=0.0).errors(rough, few)
+    weights = (norms / norms.median()).clamp(1 / 3, 3)
+    loss = LrStar(error=RMSELoss(relative=1.0, floor=0.0), per_sample=True, limit=3.0)
+    expected = (errors * weights).mean() / weights.mean()
+    assert float(loss(rough, few, physics)) == pytest.approx(float(expected), rel=1e-12)
+
+
 def test_the_residual_is_relative_to_the_largest_modal_force(scene, few, physics, near):
     problem = scene.problem
     forces = problem.internal_force(near) - few.force

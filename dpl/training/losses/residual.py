@@ -23,21 +23,36 @@ class LrStar(Loss):
     """
 
     saves = ("no backward pass through the residual: it is a constant weight",)
+    dtype = torch.float32
 
-    def __init__(self, *, error: MSE | None = None, per_sample: bool = False) -> None:
+    def __init__(
+        self, *, error: MSE | None = None, per_sample: bool = False, limit: float | None = None
+    ) -> None:
         """Choose the error and the weighting.
 
         Args:
             error: Error of displacements; None for `MSE()`.
             per_sample: Weight each sample by its own residual norm, not by the mean of the batch.
+            limit: Largest ratio of a weight to the median of its batch, and of the median to a
+                weight; the weights of a batch then have the mean 1. None: as they are. Almost
+                inverted elements have residuals that are thousands of times larger than usual, so
+                that without a limit few batches dominate the momentum of an optimiser.
+
+        Raises:
+            ValueError: `limit` is less than 1.
         """
         super().__init__()
-        self.error, self.per_sample = error or MSE(), per_sample
+        if limit is not None:
+            check_range(1, limit=limit)
+        self.error, self.per_sample, self.limit = error or MSE(), per_sample, limit
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         error = self.error.errors(prediction, batch)
-        weight = residual_norm(prediction.detach(), batch, physics)
+        weight = residual_norm(prediction.detach().double(), batch, physics)
         weight = weight if self.per_sample else weight.mean()
+        if self.limit is not None:
+            weight = (weight / weight.median()).clamp(1 / self.limit, self.limit)
+            weight = weight / weight.mean()
         self.terms = {"error": error.mean(), "residual": weight.mean()}
         return (error * weight).mean()
 
