@@ -33,10 +33,9 @@ class LrStar(Loss):
         Args:
             error: Error of displacements; None for `MSE()`.
             per_sample: Weight each sample by its own residual norm, not by the mean of the batch.
-            limit: Largest ratio of a weight to the median of its batch, and of the median to a
-                weight; the weights of a batch then have the mean 1. None: as they are. Almost
-                inverted elements have residuals that are thousands of times larger than usual, so
-                that without a limit few batches dominate the momentum of an optimiser.
+            limit: Largest residual norm over the median of its batch; larger ones count as that.
+                None: no limit. Almost inverted elements have residuals that are thousands of times
+                larger than usual, so that a few batches dominate the momentum of an optimiser.
 
         Raises:
             ValueError: `limit` is less than 1.
@@ -49,10 +48,9 @@ class LrStar(Loss):
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         error = self.error.errors(prediction, batch)
         weight = residual_norm(prediction.detach().double(), batch, physics)
-        weight = weight if self.per_sample else weight.mean()
         if self.limit is not None:
-            weight = (weight / weight.median()).clamp(1 / self.limit, self.limit)
-            weight = weight / weight.mean()
+            weight = weight.clamp(max=self.limit * weight.median())
+        weight = weight if self.per_sample else weight.mean()
         self.terms = {"error": error.mean(), "residual": weight.mean()}
         return (error * weight).mean()
 
