@@ -555,7 +555,7 @@ def test_a_loss_of_weight_zero_is_not_evaluated(few, physics, near, evaluations)
     loss.on_train_epoch_start(SimpleNamespace(current_epoch=2), None)
     loss(near, few, physics)
     assert evaluations == [4]
-    assert set(loss.terms) == {"weight", "second", "second/mse", "second/residual"}
+    assert set(loss.terms) == {"weight", "second", "second/error", "second/residual"}
 
 
 def test_the_weights_of_the_parts_of_a_blended_loss_change_too():
