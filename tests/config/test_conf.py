@@ -1,5 +1,6 @@
 """conf/ is the only registry: everything in it instantiates, composes and solves."""
 
+import importlib.util
 import itertools
 import re
 from pathlib import Path
@@ -251,6 +252,15 @@ def test_callbacks_and_loggers_are_changed_added_and_removed_by_name(compose):
     (plots,) = (one for one in trainer.callbacks if type(one).__name__ == "WorstCasePlots")
     assert plots.meshes is False
     assert [type(logger).__name__ for logger in trainer.loggers] == ["CSVLogger"] * 2
+
+
+@pytest.mark.parametrize("name", ["mlflow", "wandb"])
+def test_a_logger_whose_package_is_missing_names_its_installation(compose, name):
+    if importlib.util.find_spec(name):
+        pytest.skip(f"{name} is installed")
+    cfg = compose("folder=.", f"logger={name}", "trainer.accelerator=cpu", command="train")
+    with pytest.raises(ConfigError, match=rf"logger\.{name}: .*pip install -U '{name}"):
+        build.build_trainer(cfg)
 
 
 def test_a_model_brings_the_batch_size_and_the_epochs_that_suit_it(compose):
