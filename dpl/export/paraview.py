@@ -35,11 +35,11 @@ class ResultRow:
 def write_results(
     surrogate: TrainedSurrogate, load: Load, path: Path, *, solve_reference: bool = True
 ) -> tuple[list[ResultRow], list[Path]]:
-    """Write predictions as a series of VTU files, a PVD collection and an XDMF file.
+    """Write predictions as a series of files for ParaView, see `dpl.fem.write_series`.
 
     `path` is that of the series, without a suffix. With `solve_reference` the finite-element
     displacement and the error are written too. Returns one row for each load, and the paths of the
-    PVD and the XDMF file.
+    series.
     """
     scene = surrogate.scene
     rows, steps = [], []

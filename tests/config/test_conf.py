@@ -1,5 +1,6 @@
 """conf/ is the only registry: everything in it instantiates, composes and solves."""
 
+import importlib.util
 import itertools
 import re
 from pathlib import Path
@@ -253,6 +254,15 @@ def test_callbacks_and_loggers_are_changed_added_and_removed_by_name(compose):
     assert [type(logger).__name__ for logger in trainer.loggers] == ["CSVLogger"] * 2
 
 
+@pytest.mark.parametrize("name", ["mlflow", "wandb"])
+def test_a_logger_whose_package_is_missing_names_its_installation(compose, name):
+    if importlib.util.find_spec(name):
+        pytest.skip(f"{name} is installed")
+    cfg = compose("folder=.", f"logger={name}", "trainer.accelerator=cpu", command="train")
+    with pytest.raises(ConfigError, match=rf"logger\.{name}: .*pip install -U '{name}"):
+        build.build_trainer(cfg)
+
+
 def test_a_model_brings_the_batch_size_and_the_epochs_that_suit_it(compose):
     usual, cfg = (compose(f"model={name}", "folder=.", command="train") for name in ("fcnn", "cnn"))
     assert (usual.data.batch_size, cfg.data.batch_size) == (256, 16)
@@ -384,7 +394,7 @@ def test_a_string_is_a_group_of_the_mesh_wherever_a_region_is_expected(compose, 
         cfg = compose(*named_part, "fixed.name=foot", *lines)
         if form == r"\1":
             cfg.fixed = "foot"
-        build.check(cfg)
+        plain.check(cfg)
         scenes.append(build.build_scene(cfg))
     assert scenes[0].length == pytest.approx(4e-3)
     assert scenes[0].fingerprint == scenes[1].fingerprint

@@ -6,6 +6,7 @@ import meshio
 import numpy as np
 import pytest
 import torch
+from meshio._vtk_common import vtk_to_meshio_type
 
 from dpl.evaluation import tables
 from dpl.export import write_results
@@ -48,7 +49,7 @@ def test_series_contain_the_fields_of_the_predictions_in_si_units(make_scene_of,
     surrogate = Surrogate(FCNN(scene, width=8), MSE(), scene).eval()
     loads = scene.loads.sample((0, 12), range(2))
     rows, files = write_results(surrogate, loads, tmp_path / "new" / "series")
-    assert [path.name for path in files] == ["series.pvd", "series.xdmf"]
+    assert [path.name for path in files[:2]] == ["series.pvd", "series.xdmf"]
     collection = ElementTree.parse(files[0]).getroot()
     named = [one.get("file") for one in collection.iter("DataSet")]
     assert [one.get("timestep") for one in collection.iter("DataSet")] == ["0", "1"]
@@ -95,6 +96,37 @@ def test_series_contain_the_fields_of_the_predictions_in_si_units(make_scene_of,
                 assert np.allclose(
                     column.reshape(single.point_data[key].shape), single.point_data[key]
                 )
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_a_vtkhdf_file_contains_the_series_with_one_mesh(make_scene_of, tmp_path, name):
+    h5py = pytest.importorskip("h5py")
+    problem, rng = make_scene_of(name).problem, np.random.default_rng(0)
+    nodes, dim = problem.shape
+    mesh = problem.mesh.with_boundaries({"left": lambda x: x[0] == 0})
+    step = {"force [N/m]": (nodes, dim), "det F": nodes, "Cauchy stress [Pa]": (nodes, 3, 3)}
+    steps = [{key: rng.random(shape) for key, shape in step.items()} for _ in range(3)]
+    *_, path = write_series(tmp_path / "series", mesh, steps)
+    with h5py.File(path) as file:
+        root = file["VTKHDF"]
+        assert (root.attrs["Type"], root["Steps"].attrs["NSteps"]) == (b"UnstructuredGrid", 3)
+        points, cells = root["Points"][:], root["Connectivity"][:].reshape(len(root["Types"]), -1)
+        sizes = [root[f"NumberOf{key}"][0] for key in ("Points", "Cells", "ConnectivityIds")]
+        assert sizes == [nodes, len(cells), cells.size]
+        assert (np.diff(root["Offsets"]) == cells.shape[1]).all()
+        for k, time in enumerate(root["Steps/Values"]):
+            single = meshio.read(tmp_path / f"series_{k:03d}.vtu")
+            assert time == k
+            assert {vtk_to_meshio_type[one] for one in root["Types"]} == {single.cells[0].type}
+            assert np.array_equal(cells, single.cells[0].data)
+            assert np.array_equal(points, single.points)
+            assert np.array_equal(
+                root["CellData/skfem:b:left"], single.cell_data["skfem:b:left"][0]
+            )
+            for key, column in single.point_data.items():
+                key = key.replace("/", " per ")
+                start = root["Steps/PointDataOffsets"][key][k]
+                assert np.array_equal(root["PointData"][key][start : start + nodes], column)
 
 
 def test_without_a_reference_solution_the_error_is_nan(make_scene_of, tmp_path):

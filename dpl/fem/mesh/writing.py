@@ -16,6 +16,10 @@ from skfem.io.meshio import to_meshio
 from dpl.fem.mesh.regions import group_names
 
 MIRRORED = [1, 0, 2, 3, 4, 6, 5, 8, 7, 9]  # exchange of the first two corners of a tetrahedron
+VTK_TYPES = {  # numbers of the cell types of meshio, from vtkCellType.h
+    **{"triangle": 5, "quad": 9, "tetra": 10, "hexahedron": 12},
+    **{"triangle6": 22, "tetra10": 24, "quad9": 28, "hexahedron27": 29},
+}
 Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
 
@@ -136,8 +140,9 @@ def _quoted(name: str) -> str:
 def write_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Array]]) -> list[Path]:
     """Write the fields of several loads as a time series for ParaView.
 
-    Writes one VTU file per load, their collection `NAME.pvd`, and `NAME.xdmf` with all loads. The
-    numbers of the latter are in `NAME.h5` if h5py is installed. The time is the index of the load.
+    Writes one VTU file per load, their collection `NAME.pvd`, and `NAME.xdmf` with all loads. If
+    h5py is installed, `NAME.vtkhdf` has all loads too, and the numbers of `NAME.xdmf` are in
+    `NAME.h5`. The time is the index of the load.
 
     Args:
         path: Folder and NAME; the folder is created.
@@ -145,7 +150,7 @@ def write_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Arra
         steps: Fields of each load as in `write_mesh`.
 
     Returns:
-        Paths of the PVD and XDMF files.
+        Paths of the PVD, XDMF and, with h5py, VTKHDF files.
     """
     names = [f"{path.name}_{k:03d}.vtu" for k in range(len(steps))]
     bodies = [_to_meshio(mesh, fields) for fields in steps]
@@ -154,12 +159,55 @@ def write_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Arra
         meshio.write(path.with_name(name), body)
     collection, series = path.with_name(f"{path.name}.pvd"), path.with_name(f"{path.name}.xdmf")
     write_collection(collection, list(enumerate(names)))
-    kept = "HDF" if importlib.util.find_spec("h5py") else "XML"
+    hdf = importlib.util.find_spec("h5py") is not None
+    kept = "HDF" if hdf else "XML"
     with contextlib.chdir(path.parent), TimeSeriesWriter(series.name, data_format=kept) as file:
         file.write_points_cells(bodies[0].points, bodies[0].cells)
         for k, body in enumerate(bodies):
             file.write_data(k, point_data=body.point_data)
-    return [collection, series]
+    return [collection, series, *([_write_vtkhdf(path, bodies)] if hdf else [])]
+
+
+def _write_vtkhdf(path: Path, bodies: Sequence[meshio.Mesh]) -> Path:
+    """Write bodies that differ in their nodal fields as VTKHDF 2.0; return the path of the file.
+
+    The format is specified in the documentation of VTK, "VTKHDF File Format". Points, cells and
+    cell data are stored once, so their offsets are 0 in all steps. A name in HDF5 has no "/".
+    """
+    import h5py
+
+    body, steps = bodies[0], len(bodies)
+    (block,), once = body.cells, np.zeros(steps, dtype=np.int64)
+    tree = {
+        "NumberOfPoints": [len(body.points)],
+        "NumberOfCells": [len(block.data)],
+        "NumberOfConnectivityIds": [block.data.size],
+        "Points": body.points,
+        "Connectivity": block.data.ravel(),
+        "Offsets": np.arange(len(block.data) + 1) * block.data.shape[1],
+        "Types": np.full(len(block.data), VTK_TYPES[block.type], dtype=np.uint8),
+        "Steps/Values": np.arange(steps, dtype=np.float64),
+        "Steps/NumberOfParts": once + 1,
+        "Steps/PartOffsets": once,
+        "Steps/PointOffsets": once,
+        "Steps/CellOffsets": once[:, None],
+        "Steps/ConnectivityIdOffsets": once[:, None],
+    }
+    for name in body.point_data:
+        key = name.replace("/", " per ")
+        tree[f"PointData/{key}"] = np.concatenate([one.point_data[name] for one in bodies])
+        tree[f"Steps/PointDataOffsets/{key}"] = np.arange(steps) * len(body.points)
+    for name, (column,) in body.cell_data.items():
+        key = name.replace("/", " per ")
+        tree[f"CellData/{key}"], tree[f"Steps/CellDataOffsets/{key}"] = column, once
+    file = path.with_name(f"{path.name}.vtkhdf")
+    with h5py.File(file, "w") as root:
+        group = root.create_group("VTKHDF")
+        group.attrs["Version"], group.attrs["Type"] = (2, 0), np.bytes_("UnstructuredGrid")
+        for key, numbers in tree.items():
+            group[key] = numbers
+        group["Steps"].attrs["NSteps"] = steps
+    return file
 
 
 def write_collection(path: Path, files: Sequence[tuple[float, str]]) -> None:
