@@ -71,8 +71,7 @@ class PullingHand(Hand):
         return self._patch(node).node_mask
 
     def _patch(self, node: int) -> Patch:
-        controls = self._controls
-        return self._body.patch(node, controls.radius.value, uniform=controls.uniform.value)
+        return self._body.patch(node, self._controls.radius.value)
 
     def _request(self, make_force: Callable[[], Tensor]) -> MakeRequest:
         """Return the request of a dimensionless force (N, D), which the worker makes."""

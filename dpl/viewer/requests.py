@@ -24,14 +24,11 @@ class Patch:
         scene: The body and its loads.
         node: Node at the centre.
         radius: Radius over L [-].
-        uniform: Use equal forces on all nodes instead of modes, as for load families without
-            modes. The training contains no such loads.
     """
 
     scene: Scene
     node: int
     radius: float
-    uniform: bool = False
 
     @cached_property
     def node_mask(self) -> Tensor:
@@ -63,10 +60,13 @@ class Patch:
 
     @cached_property
     def unit_loads(self) -> Tensor:
-        """Loads of amplitude 1, of one mode or along one axis each, (M, N, D) [-]."""
+        """Loads of amplitude 1, of one mode or along one axis each, (M, N, D) [-].
+
+        Families without modes have equal forces on all nodes, which their training may not contain.
+        """
         loads = self.scene.loads
         loaded = self.node_mask[:, None] & loads.loadable_dofs
-        if self.uniform or not isinstance(loads, HasModes):
+        if not isinstance(loads, HasModes):
             size = loads.largest_force / float(loaded.any(dim=1).sum()) ** 0.5
             axes = torch.eye(loaded.shape[1], dtype=torch.float64)
             return torch.where(loaded, size * axes[:, None], 0.0)

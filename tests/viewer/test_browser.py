@@ -102,7 +102,7 @@ def test_a_mouse_drag_deforms_the_body(browser, page, tmp_path):
         browser.view.mouse.move(x, y - 8 * k)
         browser.view.wait_for_timeout(80)
     browser.view.mouse.up()
-    browser.until(lambda: page.frame.answer.method == "network")
+    browser.until(lambda: page.frame.answer.method == "prediction")
     assert page.worker.wait(240)
     moved = page.frame.points - page.body.surface.undeformed
     assert moved[:, 2].max() > 0.03, "the body follows the mouse"

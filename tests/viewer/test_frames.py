@@ -145,15 +145,6 @@ def test_the_amplitude_of_a_patch_load_is_that_of_the_training(body):
     assert not still.any()
 
 
-def test_a_uniform_force_is_out_of_distribution(body, patch_load):
-    node, _ = patch_load
-    patch = body.patch(node, 0.4, uniform=True)
-    force = patch.force_along(torch.tensor([0.0, 0.0, 1.0]).double(), 0.5)
-    acting = force[patch.node_mask & body.scene.loads.loadable_dofs.any(dim=1)]
-    assert torch.allclose(acting, acting[:1].expand_as(acting))
-    assert body.solve(body.request(force), ViewSettings()).answer.out_of_distribution
-
-
 def test_values_are_those_of_the_quantity(body, patch_load):
     _, request = patch_load
     surface = body.surface
