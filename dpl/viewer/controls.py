@@ -11,7 +11,6 @@ from torch import Tensor
 from viser import ViserServer
 
 from dpl.fem import HasModes
-from dpl.inference import Answer, GraspAnswer
 from dpl.inference.answer import LEAST_PERCENTAGE, UNKNOWN, UNRELIABLE, relative
 from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, Frame, ViewSettings
 from dpl.viewer.recording import MAX_FRAMES, RADIUS, SUFFIXES, Recording
@@ -45,7 +44,7 @@ class Controls:
     Attributes:
         mode: Mode of a drag, `PULL` or `GRASP`.
         radius: Radius of the patch over L; each mode has its own.
-        direction, amplitude, unlimited: The patch load, visible in the mode `PULL`.
+        direction, amplitude: The patch load, visible in the mode `PULL`.
         axis, angle, sliding: Rotation of the patch and whether it slides, visible in the mode
             `GRASP`; in 2D there is no axis.
         young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
@@ -122,8 +121,6 @@ class Controls:
         low, high = (value / self._young_unit for value in body.young_range)
         middle = body.young / self._young_unit
         self.young = gui.add_slider(f"E [{unit}]", low, high, round_step(low, high), middle)
-        hint = "let a drag exceed the largest load of the training"
-        self.unlimited = gui.add_checkbox("no limit", False, hint=hint)
         self._shown_mode = PULL
 
     def _add_method_controls(self) -> None:
@@ -140,8 +137,7 @@ class Controls:
         self._about.content = message(ABOUT[mode], "inherit")
         self._radii[self._shown_mode] = self.radius.value
         self.radius.value, self._shown_mode = self._radii[mode], mode
-        for control in (self.direction, self.amplitude, self.unlimited):
-            control.visible = mode == PULL
+        self.direction.visible = self.amplitude.visible = mode == PULL
         self.angle.visible = self.sliding.visible = mode == GRASP
         self.axis.visible = mode == GRASP and not self._body.surface.planar
 
@@ -179,7 +175,7 @@ class Controls:
 
         `node` is the node whose displacement is shown.
         """
-        self._result.content, self._details.content = result_table(frame, node), details(frame)
+        self._result.content, self._details.content = result_tables(frame, node)
         self._legend.content = legend(frame, top)
         if self.follows_frame and frame.answer is not None:
             limit = float(self.amplitude.max)
@@ -206,68 +202,44 @@ class Controls:
         self._state.content = message(text, colour)
 
 
-def result_table(frame: Frame, node: int) -> str:
-    """Return estimated error, forces, displacement and time of a result of the simulator.
+def result_tables(frame: Frame, node: int) -> tuple[str, str]:
+    """Return the table of a result of the simulator, and that of its details.
 
     `node` is the node whose displacement is shown, the centre of the patch.
     """
     answer, grasp = frame.answer, frame.grasp
     assert answer is not None
-    unit = "N" if frame.displacement.shape[1] == 3 else "N/m"
-    rows = [("estimated error", _error(answer.error), f"color:{_colour(answer.error)};{BOLD}")]
-    if grasp is None:
-        rows.append(("total force", _size(frame.load.force.sum(dim=0), unit), BOLD))
-    else:
-        rows += [
-            ("force of the gripper", _size(grasp.force, unit), BOLD),
-            ("moment of the gripper", _size(grasp.moment, "N m" if unit == "N" else "N"), BOLD),
+    error, outside = float(answer.error), answer.out_of_distribution
+    colour = GOOD if error < GOOD_ERROR else WARNING if error < UNRELIABLE else BAD
+    text = relative(error) if error < UNKNOWN else "above 100 %"
+    text = f"below {relative(LEAST_PERCENTAGE)}" if error < LEAST_PERCENTAGE else text
+    unit = ("N", "N m") if frame.displacement.shape[1] == 3 else ("N/m", "N")
+    place = "outside" if outside else "unknown" if np.isnan(answer.out_of_span) else "inside"
+    span = ("training range", f"{place}, amplitude {frame.amplitude:.2f}", f"color:{BAD}" * outside)
+    forces = [("total force", _size(frame.load.force.sum(dim=0), unit[0]), BOLD)]
+    warnings, others = [span] * outside, [span]
+    if grasp is not None:  # the forces of a good grasp may be outside
+        forces = [
+            ("force of the gripper", _size(grasp.force, unit[0]), BOLD),
+            ("moment of the gripper", _size(grasp.moment, unit[1]), BOLD),
         ]
-    rows += [
+        warnings, others = [], [span, ("motion error", engineering(grasp.motion_error, "m"), "")]
+    rows = [
+        ("estimated error", text, f"color:{colour};{BOLD}"),
+        *forces,
         ("displacement at the hand", _size(frame.displacement[node], "m"), BOLD),
         ("time", f"{answer.milliseconds:.1f} ms", ""),
+        *warnings,
     ]
-    if answer.out_of_distribution:
-        rows.append(("training range", _range(answer), f"color:{BAD}"))
-    return BOX.format(_rows(rows))
-
-
-def details(frame: Frame) -> str:
-    """Return method, residual, min det F, range check and summary of a result of the simulator."""
-    answer, grasp = frame.answer, frame.grasp
-    assert answer is not None
-    rows = [
+    details = [
         ("computed by", str(answer.method), ""),
         ("linear solves" if grasp is None else "iterations", f"{answer.iterations}", ""),
         ("residual ‖R‖/‖f‖", f"{frame.residual:.1e}" if frame.residual else "0", ""),
         ("min det F", f"{frame.volume_ratio:.3f}", ""),
+        *others,
     ]
-    if grasp is None:
-        rows.append(("training range", _range(answer), ""))
-    else:  # the forces of a good grasp may have any place
-        rows.append(("motion error", engineering(grasp.motion_error, "m"), ""))
-    colour = _colour(answer.error)
-    summary = (
-        f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
-        f'{colour};background:{colour}14;line-height:1.35">{html.escape(answer.summary)}</div>'
-    )
-    return BOX.format(_rows(rows) + summary)
-
-
-def _range(answer: Answer | GraspAnswer) -> str:
-    outside, known = answer.out_of_distribution, not np.isnan(answer.out_of_span)
-    place = "outside" if outside else "inside" if known else "unknown"
-    return f"{place}, amplitude {answer.amplitude:.2f}"
-
-
-def _colour(error: float) -> str:
-    return GOOD if error < GOOD_ERROR else WARNING if error < UNRELIABLE else BAD
-
-
-def _error(error: float) -> str:
-    """Return an estimated error in per cent."""
-    if not error < UNKNOWN:
-        return "above 100 %"
-    return relative(error) if error >= LEAST_PERCENTAGE else f"below {relative(LEAST_PERCENTAGE)}"
+    summary = f'<div style="line-height:1.35">{html.escape(answer.summary)}</div>'
+    return BOX.format(_rows(rows)), BOX.format(_rows(details) + summary)
 
 
 def _size(vector: ArrayLike, unit: str) -> str:

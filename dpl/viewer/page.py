@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 import viser
-from torch import Tensor
 
 from dpl.viewer.access import AccessPolicy, check_server, serve_with
 from dpl.viewer.camera import UP, Placement
@@ -26,7 +25,6 @@ from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
 PICK_RADIUS = 0.02  # distance of a ray to the points that it may pick, beyond the nearest, over L
-
 SLOW = 1.0  # time of a solve from which the page shows it [s]
 
 
@@ -78,7 +76,7 @@ class Page:
         self.placement = Placement.of(body, self.node, self.controls.radius.value)
         self._build_scene()
         self._connect()
-        self._mark(self._rotating(1.0).force)
+        self._marker.mask = self._rotating(1.0).force.any(dim=1).numpy()[body.surface.nodes]
         self.worker.submit(settings=self.controls.settings())
         self.worker.start()
 
@@ -189,7 +187,7 @@ class Page:
         self.controls.follows_frame = True
         self._release()
         self._submit(lambda: request)
-        self._mark(request.force)
+        self._marker.mask = request.force.any(dim=1).numpy()[self.body.surface.nodes]
         self.node = self.body.surface.middle_node(self._marker.mask)
 
     def reset(self, event: Any) -> None:
@@ -260,10 +258,6 @@ class Page:
         self._make_request, young = make, self.controls.modulus
         parameters = {name: slider.value for name, slider in self.controls.parameters.items()}
         self.worker.submit(lambda: self.body.with_moduli(make(), young, parameters))
-
-    def _mark(self, force: Tensor) -> None:
-        """Mark the nodes with a force, (N, D)."""
-        self._marker.mask = force.any(dim=1).numpy()[self.body.surface.nodes]
 
     def _mark_patch(self) -> None:
         """Mark the nodes of the patch and remove the error message."""

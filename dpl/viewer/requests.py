@@ -81,19 +81,17 @@ class Patch:
             [linear.solve(load)[self.node] - without for load in self.unit_loads], dim=1
         )
 
-    def force_towards(self, displacement: Tensor, *, max_amplitude: float | None = 1.0) -> Tensor:
+    def force_towards(self, displacement: Tensor) -> Tensor:
         """Return the force (N, D) [-] whose linear response moves the centre by `displacement`.
 
         Of all such forces the one with the smallest amplitudes, by ridge regression; it is scaled
-        down to `max_amplitude` of a unit load. The displacement is over L, (D,) [-].
+        down to the size of a unit load. The displacement is over L, (D,) [-].
         """
         C = self.compliance
         square = C @ C.T
         ridge = RIDGE * square.diagonal().sum() * torch.eye(len(C), dtype=C.dtype)
         amplitudes = C.T @ torch.linalg.solve(square + ridge, displacement)
-        largest = float(amplitudes.abs().max())
-        if max_amplitude is not None and largest > max_amplitude:
-            amplitudes = amplitudes * (max_amplitude / largest)
+        amplitudes = amplitudes / max(float(amplitudes.abs().max()), 1.0)
         return torch.einsum("m,mnd->nd", amplitudes, self.unit_loads)
 
     def force_along(self, direction: Tensor, amplitude: float) -> Tensor:

@@ -38,7 +38,7 @@ def pages(request, make_scene, make_body, tmp_path_factory):
     body, folder = make_body(make_scene(**BODIES[request.param])), tmp_path_factory.mktemp("page")
     page = Page(body, AccessPolicy.bind("127.0.0.1", 0), title="t", folder=folder)
     controls, node, radii = page.controls, page.node, dict(page.controls._radii)
-    switches = (controls.mode, controls.unlimited, *controls.of_load, *controls.of_moduli)
+    switches = (controls.mode, *controls.of_load, *controls.of_moduli)
     values = [(control, control.value) for control in (*switches, *controls.of_settings)]
     assert page.worker.wait(240)
 
@@ -150,7 +150,7 @@ def test_the_angle_rotates_a_grasped_patch(page):
 def test_each_mode_has_its_controls_and_its_radius(page):
     controls = page.controls
     planar = page.body.scene.problem.shape[1] == 2
-    of_pull = (controls.direction, controls.amplitude, controls.unlimited)
+    of_pull = (controls.direction, controls.amplitude)
     controls.radius.value = 0.31
     for mode in (GRASP, PULL):
         select(page, mode)
