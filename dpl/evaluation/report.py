@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -157,6 +157,7 @@ def evaluate(
     }
     with one_thread():
         rows, displacements = measure(solvers, test, scene.problem)
+        estimates: dict[str, Callable[[Load, Tensor], float]]
         estimates = dict.fromkeys(solvers, partial(_estimated, scene.linear))
         estimates |= {name: solver.error for name, solver in simulated.items()}
         estimates |= dict.fromkeys((PREDICTION, ONE_STEP), simulator.prediction_error)

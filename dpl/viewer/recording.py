@@ -262,9 +262,11 @@ def rotating_load(body: Body) -> Callable[[float], LoadRequest]:
     if all(found and not found.out_of_distribution and found.out_of_span >= 0 for found in tried):
         return rotated
     samples = [body.solve(body.sample(index), ViewSettings()) for index in range(SAMPLES)]
-    largest = max(samples, key=lambda frame: float(frame.displacement.norm()))
-    force = loads.own_force(largest.load.dimensionless(body.scene).force)[0]
-    return lambda time: body.request(math.sin(math.pi * time / DURATION) ** 2 * force)
+    largest = max(samples, key=lambda frame: float(frame.displacement.norm())).load
+    rest, force = body.zero_load(), largest.force * (body.young / largest.young)
+    return lambda time: rest._replace(
+        force=torch.lerp(rest.force, force, math.sin(math.pi * time / DURATION) ** 2)
+    )
 
 
 def farthest_node(body: Body) -> int:

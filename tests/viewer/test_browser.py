@@ -116,6 +116,8 @@ def test_a_grasped_patch_follows_the_mouse_and_rotates(browser, page):
     browser.control("drag").click()
     browser.view.get_by_role("option", name="grasp").click()
     browser.wait_for_text("Click it to grasp another patch.")
+    browser.view.get_by_text("Reset", exact=True).click()
+    browser.until(lambda: page.frame.answer.method == "rest")
     x, y = browser.body()
     browser.view.mouse.move(x, y)
     time.sleep(1)
