@@ -1,5 +1,5 @@
 # make train: environment, installation and the main job: two models of the paper's beam, compared.
-# make demo:  a model of the paper's beam, fitted to 64 loads, and its page for the browser.
+# make demo:  a model of a hollow silicone finger, fitted to 128 loads, and its page for the browser.
 # make test:  installation and the checks that CI makes; WORKERS processes share the tests.
 # make slow: the tests that take minutes.
 # make gpu: the tests that need a GPU (with DDP on all visible ones), then speed and memory of each
@@ -17,7 +17,8 @@ WORKERS ?= 2
 PIP := $(BIN)/pip install --quiet --no-compile -c constraints.txt  # Python compiles what it imports
 
 FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M)
-DEMO := $(BIN)/python scripts/train.py data.train=64 data.val=16 data.test=8 model.rank=60 model.cells=80 \
+DEMO := $(BIN)/python scripts/train.py mesh=finger mesh.size=[0.08,0.02,0.02] mesh.cells=[24,8,8] young=1e6 \
+  material.poisson=0.4 loads.deflection=0.2 data.train=128 data.val=16 data.test=8 model.rank=80 model.cells=120 \
   run=runs/demo
 
 .PHONY: setup train demo paper test lint slow gpu matrix mutants tables docs pictures wheel clean

@@ -55,7 +55,7 @@ class Row:
     """Errors and times of a method for many grasps.
 
     Attributes:
-        method: "network", "corrected", "hybrid to 1e-6" or "Newton from rest to 1e-6".
+        method: "prediction", "corrected", "hybrid to 1e-6" or "Newton from rest to 1e-6".
         count: Number of grasps.
         found: Part of the grasps with forces under which the network predicts the motion [%]; 100
             for Newton's method from rest.
@@ -204,7 +204,7 @@ def measure(
     scene = gripper.scene
     raw = Gripper(gripper.surrogate, steps=0)
     options = {
-        "network": (raw, None),
+        "prediction": (raw, None),
         "corrected": (gripper, None),
         "hybrid to 1e-6": (gripper, TOL),
     }

@@ -44,7 +44,7 @@ def serve(
     try:
         print(f"the page is at {policy.url}  (Ctrl-C ends it)", flush=True)
         while True:
-            time.sleep(0.1)
+            time.sleep(0.05)
             page.refresh()
     finally:
         page.close()

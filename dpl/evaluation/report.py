@@ -2,8 +2,9 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from dpl.fem import (
     estimate_error,
     write_mesh,
 )
-from dpl.inference import Corrected, Direct, Hybrid, Simulator
+from dpl.inference import Answer, Corrected, Direct, Hybrid, Simulator
 from dpl.scene import Sample, Scene
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, TrainedSurrogate
@@ -43,6 +44,7 @@ from dpl.visualization import plot_deformed
 
 ERRORS = (1e-3,)  # estimated relative errors of the simulator [-]
 LEAST_ERROR = 1e-12  # estimated error at which no step is made [-]
+ONE_STEP = f"{PREDICTION}, 1 step"  # name of a row
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,8 @@ class SolverResult:
         max_iterations: Maximum number of linear solves.
         ms: Median wall time of one load, with its residual and min det F [ms].
         ms_p99: 99th percentile of this time [ms].
-        estimated_error: Median of the estimated relative error, see `estimate_error` [-];
-            infinite: not computed.
+        estimated_error: Median of the estimated relative error [-]: for predictions and the
+            simulator that of `Answer`, else that of `estimate_error`; infinite: not computed.
         latency: Latency of `sim(force)` and of the bare network; empty for other solvers.
     """
 
@@ -141,6 +143,8 @@ def evaluate(
     """
     scene, simulator = surrogate.scene, Simulator(surrogate)
     tight, linear = min(tols), _own(scene).linear_solver
+    simulated = {error_row(error): _Simulated(simulator, {"error": error}) for error in errors}
+    simulated |= {simulator_row(tol): _Simulated(simulator, {"tol": tol}) for tol in tols}
     solvers: dict[str, Solver] = {
         "linear": replace(linear, tol=tight, parent=linear),  # with its factor
         PREDICTION: Direct(surrogate.predict, scene.problem, tight),
@@ -148,14 +152,20 @@ def evaluate(
         f"paper's hybrid to {power(tight)}": Hybrid(
             surrogate.predict, replace(_own(scene), tol=tight), "paper"
         ),
-        **{error_row(error): _Simulated(simulator, {"error": error}) for error in errors},
-        **{simulator_row(tol): _Simulated(simulator, {"tol": tol}) for tol in tols},
+        **simulated,
         **{newton_row(tol): replace(_own(scene), tol=tol) for tol in tols},
     }
     with one_thread():
         rows, displacements = measure(solvers, test, scene.problem)
-        estimates = {name: _estimated(scene, test, u) for name, u in displacements.items()}
-    rows = [replace(row, estimated_error=estimates[row.solver]) for row in rows]
+        estimates: dict[str, Callable[[Load, Tensor], float]]
+        estimates = dict.fromkeys(solvers, partial(_estimated, scene.linear))
+        estimates |= {name: solver.error for name, solver in simulated.items()}
+        estimates |= dict.fromkeys((PREDICTION, ONE_STEP), simulator.prediction_error)
+        medians = {
+            name: float(np.median(list(map(estimates[name], test.load.unbatch(), u.split(1)))))
+            for name, u in displacements.items()
+        }
+    rows = [replace(row, estimated_error=medians[row.solver]) for row in rows]
     latency = latencies(simulator, test.load)
     rows = [replace(row, latency=latency) if row.solver == PREDICTION else row for row in rows]
     show(rows, f"{len(test.force)} test loads, one at a time, 1 thread; errors are relative L2")
@@ -165,11 +175,9 @@ def evaluate(
     return rows
 
 
-def _estimated(scene: Scene, test: Sample, displacement: Tensor) -> float:
-    """Return the median of the estimated relative errors of displacements (B, N, D) [-]."""
-    pairs = zip(test.load.unbatch(), displacement.split(1), strict=True)
-    errors = [estimate_error(scene.linear, load, found).error for load, found in pairs]
-    return float(np.median(errors))
+def _estimated(linear: LinearSolver, load: Load, displacement: Tensor) -> float:
+    """Return the estimated relative error of a displacement (1, N, D) [-]."""
+    return estimate_error(linear, load, displacement).error
 
 
 @dataclass(frozen=True)
@@ -186,13 +194,21 @@ class _Simulated:
     simulator: Simulator
     tolerance: Mapping[str, float]
 
-    def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the answer of the simulator."""
+    def answer(self, load: Load) -> Answer:
+        """Return the answer of the simulator."""
         scene = self.simulator.scene
         if scene.problem.material.parameter_ranges:  # each load has its own K(0) and factor
             scene.linear.forget_clones()
         arguments: dict[str, Any] = {**scene.si_inputs(load), **self.tolerance}
-        answer = self.simulator(**arguments)
+        return self.simulator(**arguments)
+
+    def error(self, load: Load, displacement: Tensor) -> float:
+        """Return the estimated relative error that the answer states [-]."""
+        return float(self.answer(load).error)
+
+    def iterate(self, load: Load) -> Iterator[Solution]:
+        """Yield the answer of the simulator."""
+        scene, answer = self.simulator.scene, self.answer(load)
         met = answer.converged | (answer.error <= self.tolerance.get("error", -1.0))
         count = torch.zeros_like(answer.iterations)
         yield Solution(
@@ -216,7 +232,7 @@ def _step_in_modes(surrogate: TrainedSurrogate, tol: float) -> dict[str, Solver]
         return {}
     one = replace(newton, tol=tol, max_iter=1, error_tol=LEAST_ERROR)
     one.tangent  # noqa: B018  # built here, so that the first call is not slower
-    return {f"{PREDICTION}, 1 step": Corrected(surrogate.predict, one)}
+    return {ONE_STEP: Corrected(surrogate.predict, one)}
 
 
 def _own(scene: Scene) -> Newton:

@@ -39,7 +39,7 @@ class Answer:
         out_of_span: Norm of the part of the force that no load of the training explains, over that
             of the force [-]; NaN if the load family cannot recognise its loads.
         out_of_distribution: True if the load lies outside the training range, as far as known.
-        method: Method that computed the result: "rest", "linear", "network", "corrected",
+        method: Method that computed the result: "rest", "linear", "prediction", "corrected",
             "hybrid" or "full Newton".
         iterations: Linear solves with a tangent.
         milliseconds: Wall time [ms]; of several loads, the share of each.

@@ -62,7 +62,7 @@ class GraspAnswer:
             not contain.
         out_of_distribution: True if the forces are outside the training range and `error` is not
             below 10 %.
-        method: "network", "corrected", "hybrid" or "full Newton".
+        method: "prediction", "corrected", "hybrid" or "full Newton".
         iterations: Predictions of the network and corrections, or linear solves of Newton's method.
         milliseconds: Wall time [ms].
         forces_found: True if the network predicts the motion under forces that were found. False:
@@ -168,7 +168,7 @@ class HeldBody:
                 newton.problem, field[None], self.load, newton.tol, from_guess=True
             )
             state = state._replace(iterations=state.iterations + count)
-            yield Candidate("network", state, force=forces.force)
+            yield Candidate("prediction", state, force=forces.force)
         else:
             guess = best.displacement
             yield Candidate("corrected", best._replace(iterations=best.iterations + count))

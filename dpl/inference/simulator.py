@@ -157,6 +157,16 @@ class Simulator:
             answer = self._reported(found, places, request)
         return answer_like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
 
+    def prediction_error(self, load: Load, prediction: Tensor) -> float:
+        """Return the estimated relative error that a call states for a prediction (1, N, D) [-].
+
+        `load` has B = 1. The prediction may contain steps in the modes.
+        """
+        place, request = RangeCheck.of(self.surrogate, load), Request(None, None, None, warm=False)
+        own = replace(request, products=self._products(place, request))
+        candidate = self._in_modes(load, prediction, place, own, taken=self.steps)
+        return self._with_error(load, candidate, own).known_error
+
     @cached_property
     def grasp(self) -> Gripper:
         """The gripper of the body, called as `sim.grasp(region, translation, rotation)`."""
@@ -314,7 +324,7 @@ class Simulator:
         problem, tol = self.scene.problem, self.scene.solver.tol
         return all(
             not self._distance(
-                load, _evaluated("network", problem, self.surrogate.predict(load), load, tol)
+                load, _evaluated("prediction", problem, self.surrogate.predict(load), load, tol)
             )
             <= FAR
             for load in self.scene.loads.sample((0, POOR_STREAM), range(3)).unbatch()
@@ -369,7 +379,7 @@ class Simulator:
         """Return a displacement after Newton's steps in the modes; `taken` steps precede them."""
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
         if self.newton is None or not guess.abs().amax().isfinite():
-            return _evaluated("network", problem, guess, load, tol)
+            return _evaluated("prediction", problem, guess, load, tol)
         wanted = ERROR if request.error is None else request.error
         begin, pace = time.perf_counter(), 0.0
         states = self.newton.states(
@@ -386,7 +396,7 @@ class Simulator:
         outside = self.newton.outside_error  # 0 if it is not known
         in_range = bool(place.inside & (solution.residual < MAX_RESIDUAL))
         return Candidate(
-            "corrected" if taken + state.iterations else "network",
+            "corrected" if taken + state.iterations else "prediction",
             solution,
             error_in_modes=state.error,
             error_outside=outside if outside > 0 and in_range else math.inf,
@@ -412,6 +422,6 @@ def _evaluated(
     """Return a displacement as a solution, with its evaluation."""
     evaluation = problem.with_parameters(load.parameters).evaluate(displacement)
     state = evaluate_solution(
-        problem, displacement, load, tol, from_guess=method == "network", evaluation=evaluation
+        problem, displacement, load, tol, from_guess=method == "prediction", evaluation=evaluation
     )
     return Candidate(method, state, evaluation=evaluation)

@@ -11,13 +11,14 @@ from torch import Tensor
 from viser import ViserServer
 
 from dpl.fem import HasModes
-from dpl.inference.answer import UNRELIABLE, relative
+from dpl.inference.answer import LEAST_PERCENTAGE, UNKNOWN, UNRELIABLE, relative
 from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, Frame, ViewSettings
-from dpl.viewer.recording import MAX_FRAMES, SUFFIXES, Recording
-from dpl.viewer.renderer import N_BANDS, band_colours
+from dpl.viewer.recording import MAX_FRAMES, RADIUS, SUFFIXES, Recording
+from dpl.viewer.renderer import band_colours
 from dpl.viewer.units import engineering, round_step, scaled, tick_labels, unit_for
 
 GOOD, WARNING, BAD = "#15803d", "#b45309", "#b91c1c"
+GOOD_ERROR = 0.01  # estimated error below which it is green [-]
 ROW = (
     '<div style="display:flex;justify-content:space-between;gap:12px;line-height:1.65">'
     '<span style="opacity:.62">{}</span>'
@@ -26,15 +27,15 @@ ROW = (
 BOLD = "font-weight:600"
 BOX = '<div style="padding:2px 12px 6px;font-size:13.5px">{}</div>'
 LABELS = {"poisson": "Poisson's ratio"}  # of parameters
-NETWORK, BUDGET = "network", "best within the budget"
+PREDICTION, BUDGET = "prediction", "best within the budget"
 PULL, GRASP = "pull", "grasp"
 ABOUT = {
     PULL: "Drag the body to pull it. Click it to place the loaded patch.",
     GRASP: "Drag the body to move a patch of it as a rigid body. Click it to grasp another patch.",
 }
-RADIUS = {PULL: 0.4, GRASP: 0.15}  # of the patch over L, at first [-]
+RADII = {PULL: RADIUS, GRASP: 0.15}  # of the patch over L, at first [-]
 AXES = {"x": 0, "y": 1, "z": 2}
-METHODS = {NETWORK: None, **{f"residual below {tol:.0e}": tol for tol in TOLERANCES}}
+METHODS = {PREDICTION: None, **{f"residual below {tol:.0e}": tol for tol in TOLERANCES}}
 
 
 class Controls:
@@ -43,21 +44,21 @@ class Controls:
     Attributes:
         mode: Mode of a drag, `PULL` or `GRASP`.
         radius: Radius of the patch over L; each mode has its own.
-        direction, amplitude, unlimited, uniform: The patch load, visible in the mode `PULL`.
+        direction, amplitude: The patch load, visible in the mode `PULL`.
         axis, angle, sliding: Rotation of the patch and whether it slides, visible in the mode
             `GRASP`; in 2D there is no axis.
         young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
         parameters: Sliders of the ranges of law and follower loads, by name.
         sample, reset, fit: Buttons for a random load, for no load and for the camera.
-        method, budget, correction, quantity, edges, show_newton: Method and display.
+        method, budget, quantity, edges, show_newton: Method and display.
         record, save: Buttons of the recording.
         of_load, of_moduli, of_settings: The widgets that change load or grasp, moduli or settings.
-        follows_frame: True while a drag or a random load determines the load, so that the slider
-            shows the amplitude of the frame.
+        follows_frame: True while the page, a drag or a random load determines the load, so that the
+            slider shows the amplitude of the frame.
     """
 
     def __init__(self, server: ViserServer, body: Body, title: str, folder: Path) -> None:
-        """Add the widgets to the panel."""
+        """Add the widgets to the panel; those that few users need are in closed folders."""
         gui, scene = server.gui, body.scene
         self._gui, self._body = gui, body
         nodes, dim = scene.problem.shape
@@ -67,67 +68,65 @@ class Controls:
         self._result, self._legend = gui.add_html(""), gui.add_html("")
         self._newton = gui.add_html("", visible=False)
         self._error = gui.add_html("")
-        with gui.add_folder("Load"):
+        self._add_hand_controls()
+        with gui.add_folder("Details of the result", expand_by_default=False):
+            self._details = gui.add_html("")
+        with gui.add_folder("Load", expand_by_default=False):
             self._add_load_controls()
-        with gui.add_folder("Method and colours"):
+        with gui.add_folder("Method and view", expand_by_default=False):
             self._add_method_controls()
+        self.show_mode()
         with gui.add_folder("Record", expand_by_default=False):
             self.record = gui.add_button("Start recording", color="red")
             self._state = gui.add_html(message(f"Files are saved in {folder}", "inherit"))
             self.save = gui.add_button_group("save as", tuple(SUFFIXES))
-        self.follows_frame = False
+        self.follows_frame = True
         of_patch = (self.radius, self.axis, self.angle, self.sliding)
-        self.of_load = (self.direction, self.amplitude, self.uniform, *of_patch)
+        self.of_load = (self.direction, self.amplitude, *of_patch)
         self.of_moduli = (self.young, *self.parameters.values())
         shown = (self.quantity, self.edges, self.show_newton)
-        self.of_settings = (self.method, self.budget, self.correction, *shown)
+        self.of_settings = (self.method, self.budget, *shown)
 
-    def _add_load_controls(self) -> None:
-        gui, body, loads = self._gui, self._body, self._body.scene.loads
-        self.mode = gui.add_dropdown("drag", (PULL, GRASP))
+    def _add_hand_controls(self) -> None:
+        gui, body = self._gui, self._body
         self._about = gui.add_html("")
-        span = loads.patch_radius if isinstance(loads, HasModes) else (0.0, 1.0)
-        low, high = float(span[0]), max(float(span[1]), 0.05)
-        first = min(max(RADIUS[PULL], low), high)
-        self._radii = {PULL: first, GRASP: min(RADIUS[GRASP], high)}
-        self.radius = gui.add_slider("radius / L", 0.0, high, 0.01, first)
-        upwards = (0.0, 1.0, 0.0) if body.surface.planar else (0.0, 0.0, 1.0)
-        self.direction = gui.add_vector3("direction", upwards, step=0.1)
-        self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
+        self.mode = gui.add_dropdown("drag", (PULL, GRASP))
         self.axis = gui.add_dropdown("rotation axis", tuple(AXES), initial_value="y")
         self.angle = gui.add_slider("rotation [°]", -90.0, 90.0, 1.0, 0.0, marks=(-90, 0, 90))
-        hint = "hold the patch along its normal alone, so that it slides in its plane"
-        self.sliding = gui.add_checkbox("sliding", False, hint=hint)
-        unit, self._young_unit = unit_for(body.young, "Pa")
-        low, high = (value / self._young_unit for value in body.young_range)
-        middle = body.young / self._young_unit
-        self.young = gui.add_slider(f"E [{unit}]", low, high, round_step(low, high), middle)
         stresses = {name: f"{name} [Pa]" for name in body.scene.problem.follower_loads.ranges}
         labels = LABELS | stresses
         self.parameters = {
             name: gui.add_slider(
                 labels.get(name, name), *ends, round_step(*ends), body.parameters[name]
             )
-            for name, ends in loads.parameter_ranges.items()
+            for name, ends in body.scene.loads.parameter_ranges.items()
         }
-        hint = "let a drag exceed the largest load of the training"
-        self.unlimited = gui.add_checkbox("no limit", False, hint=hint)
-        hint = "equal forces on all nodes of the patch, outside the training range"
-        self.uniform = gui.add_checkbox("uniform force", False, hint=hint)
+        self.quantity = gui.add_dropdown("colours", tuple(QUANTITIES))
         self.sample = gui.add_button("Random training load")
         self.reset = gui.add_button("Reset", color="gray")
+
+    def _add_load_controls(self) -> None:
+        gui, body, loads = self._gui, self._body, self._body.scene.loads
+        span = loads.patch_radius if isinstance(loads, HasModes) else (0.0, 1.0)
+        low, high = float(span[0]), max(float(span[1]), 0.05)
+        first = min(max(RADII[PULL], low), high)
+        self._radii = {PULL: first, GRASP: min(RADII[GRASP], high)}
+        self.radius = gui.add_slider("radius / L", 0.0, high, 0.01, first)
+        upwards = (0.0, 1.0, 0.0) if body.surface.planar else (0.0, 0.0, 1.0)
+        self.direction = gui.add_vector3("direction", upwards, step=0.1)
+        self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
+        hint = "hold the patch along its normal alone, so that it slides in its plane"
+        self.sliding = gui.add_checkbox("sliding", False, hint=hint)
+        unit, self._young_unit = unit_for(body.young, "Pa")
+        low, high = (value / self._young_unit for value in body.young_range)
+        middle = body.young / self._young_unit
+        self.young = gui.add_slider(f"E [{unit}]", low, high, round_step(low, high), middle)
         self._shown_mode = PULL
-        self.show_mode()
 
     def _add_method_controls(self) -> None:
-        gui, correction = self._gui, self._body.has_correction
+        gui = self._gui
         self.method = gui.add_dropdown("method", (*METHODS, BUDGET))
         self.budget = gui.add_number("budget [ms]", 20.0, min=0.1, max=10_000.0)
-        hint = "correct the prediction in the modes of the network before Newton"
-        self.correction = gui.add_checkbox(
-            "Newton in the modes", correction, visible=correction, hint=hint
-        )
-        self.quantity = gui.add_dropdown("colours", tuple(QUANTITIES))
         self.edges = gui.add_checkbox("mesh edges", False)
         self.show_newton = gui.add_checkbox("compare Newton", False)
         self.fit = gui.add_button("Fit the view", color="gray")
@@ -138,8 +137,7 @@ class Controls:
         self._about.content = message(ABOUT[mode], "inherit")
         self._radii[self._shown_mode] = self.radius.value
         self.radius.value, self._shown_mode = self._radii[mode], mode
-        for control in (self.direction, self.amplitude, self.unlimited, self.uniform):
-            control.visible = mode == PULL
+        self.direction.visible = self.amplitude.visible = mode == PULL
         self.angle.visible = self.sliding.visible = mode == GRASP
         self.axis.visible = mode == GRASP and not self._body.surface.planar
 
@@ -169,16 +167,15 @@ class Controls:
             self.quantity.value,
             TOLERANCES[-1] if within_budget else METHODS.get(self.method.value),
             self.budget.value if within_budget else None,
-            bool(self.correction.value) and self._body.has_correction,
             bool(self.show_newton.value),
         )
 
-    def show_frame(self, frame: Frame, top: float, frame_rate: float, node: int) -> None:
-        """Update result, legend and, if a drag determined the load, the amplitude.
+    def show_frame(self, frame: Frame, top: float, node: int) -> None:
+        """Update result, details, legend and, with `follows_frame`, the amplitude.
 
         `node` is the node whose displacement is shown.
         """
-        self._result.content = result_table(frame, frame_rate, node)
+        self._result.content, self._details.content = result_tables(frame, node)
         self._legend.content = legend(frame, top)
         if self.follows_frame and frame.answer is not None:
             limit = float(self.amplitude.max)
@@ -205,43 +202,44 @@ class Controls:
         self._state.content = message(text, colour)
 
 
-def result_table(frame: Frame, frame_rate: float, node: int) -> str:
-    """Return forces, method, time, residual, range check and summary of a result of the simulator.
+def result_tables(frame: Frame, node: int) -> tuple[str, str]:
+    """Return the table of a result of the simulator, and that of its details.
 
     `node` is the node whose displacement is shown, the centre of the patch.
     """
     answer, grasp = frame.answer, frame.grasp
     assert answer is not None
-    colour = GOOD if frame.converged else WARNING if frame.volume_ratio > 0 else BAD
-    unit = "N" if frame.displacement.shape[1] == 3 else "N/m"
-    if grasp is None:
-        rows = [("total force", _size(frame.load.force.sum(dim=0), unit), BOLD)]
-    else:
-        rows = [
-            ("force of the gripper", _size(grasp.force, unit), BOLD),
-            ("moment of the gripper", _size(grasp.moment, "N m" if unit == "N" else "N"), BOLD),
-            ("motion error", engineering(grasp.motion_error, "m"), ""),
+    error, outside = float(answer.error), answer.out_of_distribution
+    colour = GOOD if error < GOOD_ERROR else WARNING if error < UNRELIABLE else BAD
+    text = relative(error) if error < UNKNOWN else "above 100 %"
+    text = f"below {relative(LEAST_PERCENTAGE)}" if error < LEAST_PERCENTAGE else text
+    unit = ("N", "N m") if frame.displacement.shape[1] == 3 else ("N/m", "N")
+    place = "outside" if outside else "unknown" if np.isnan(answer.out_of_span) else "inside"
+    span = ("training range", f"{place}, amplitude {frame.amplitude:.2f}", f"color:{BAD}" * outside)
+    forces = [("total force", _size(frame.load.force.sum(dim=0), unit[0]), BOLD)]
+    warnings, others = [span] * outside, [span]
+    if grasp is not None:  # the forces of a good grasp may be outside
+        forces = [
+            ("force of the gripper", _size(grasp.force, unit[0]), BOLD),
+            ("moment of the gripper", _size(grasp.moment, unit[1]), BOLD),
         ]
-    residual = f"{frame.residual:.1e}" if frame.residual else "0"
-    rows += [
+        warnings, others = [], [span, ("motion error", engineering(grasp.motion_error, "m"), "")]
+    rows = [
+        ("estimated error", text, f"color:{colour};{BOLD}"),
+        *forces,
         ("displacement at the hand", _size(frame.displacement[node], "m"), BOLD),
-        ("computed by", str(answer.method), BOLD),
-        ("time", f"{answer.milliseconds:.1f} ms, {frame_rate:.0f} fps", ""),
-        ("estimated error", relative(float(answer.error)), f"color:{colour}"),
-        ("residual ‖R‖/‖f‖", residual, f"color:{colour}"),
-        ("min det F", f"{frame.volume_ratio:.3f}", ""),
-        ("linear solves" if grasp is None else "iterations", f"{answer.iterations}", ""),
+        ("time", f"{answer.milliseconds:.1f} ms", ""),
+        *warnings,
     ]
-    outside = answer.out_of_distribution
-    if grasp is None or outside:  # the forces of a good grasp may have any place
-        place = "outside" if outside else "unknown" if np.isnan(answer.out_of_span) else "inside"
-        span = f"{place}, amplitude {answer.amplitude:.2f}"
-        rows.append(("training range", span, f"color:{BAD if outside else GOOD}"))
-    summary = (
-        f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
-        f'{colour};background:{colour}14;line-height:1.35">{html.escape(answer.summary)}</div>'
-    )
-    return BOX.format(_rows(rows) + summary)
+    details = [
+        ("computed by", str(answer.method), ""),
+        ("linear solves" if grasp is None else "iterations", f"{answer.iterations}", ""),
+        ("residual ‖R‖/‖f‖", f"{frame.residual:.1e}" if frame.residual else "0", ""),
+        ("min det F", f"{frame.volume_ratio:.3f}", ""),
+        *others,
+    ]
+    summary = f'<div style="line-height:1.35">{html.escape(answer.summary)}</div>'
+    return BOX.format(_rows(rows)), BOX.format(_rows(details) + summary)
 
 
 def _size(vector: ArrayLike, unit: str) -> str:
@@ -308,9 +306,7 @@ def legend(frame: Frame, top: float) -> str:
     ticks = "".join(f"<span>{label}</span>" for label in labels)
     span = f"{scaled(low, size)} to {scaled(high, size)} {unit}"
     return BOX.format(
-        f'<div style="display:flex;justify-content:space-between;margin-bottom:4px">'
-        f"<b>{html.escape(f'{quantity} [{unit}]')}</b>"
-        f'<span style="opacity:.62">{N_BANDS} bands</span></div>'
+        f'<div style="margin-bottom:4px"><b>{html.escape(f"{quantity} [{unit}]")}</b></div>'
         f'<div style="display:flex;height:14px;border-radius:3px;overflow:hidden">{cells}</div>'
         f'<div style="display:flex;justify-content:space-between;font-size:11.5px;opacity:.75">'
         f"{ticks}</div>" + _rows([("on the surface", span, "")])

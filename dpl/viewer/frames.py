@@ -32,16 +32,14 @@ class ViewSettings:
 
     Attributes:
         quantity: Quantity that colours show, a key of `QUANTITIES`.
-        tol: Relative residual to reach [-]; None: the prediction of the network.
+        tol: Relative residual to reach [-]; None: the prediction, corrected in the modes.
         budget_ms: Largest wall time [ms]; None: no limit.
-        correction: Correct the prediction in the modes of the network before Newton.
         show_newton: Also show the iterates of Newton from zero displacement.
     """
 
     quantity: str = "displacement"
     tol: float | None = None
     budget_ms: float | None = None
-    correction: bool = False
     show_newton: bool = False
 
     def __post_init__(self) -> None:
@@ -102,8 +100,8 @@ class Body:
         surface: Surface of the body.
         young: Default Young's modulus, the middle of the training range [Pa].
         parameters: Default parameters of the law by name, alike.
-        patch: Function from node, radius and `uniform` to a `Patch`. It caches the last one, which
-            takes several solves.
+        patch: Function from node and radius to a `Patch`. It caches the last one, which takes
+            several solves.
     """
 
     def __init__(self, simulator: Simulator) -> None:
@@ -114,15 +112,7 @@ class Body:
         self.young = self.scene.loads.moduli.middle
         ranges = self.scene.loads.parameter_ranges
         self.parameters = {name: ends.middle for name, ends in ranges.items()}
-        self._uncorrected = simulator
-        if self.has_correction:
-            self._uncorrected = Simulator(simulator.surrogate, steps=0)
         self.patch = lru_cache(maxsize=1)(partial(Patch, self.scene))
-
-    @property
-    def has_correction(self) -> bool:
-        """True if the simulator can correct predictions in the modes of the network."""
-        return self.simulator.newton is not None
 
     @property
     def young_range(self) -> tuple[float, float]:
@@ -193,11 +183,10 @@ class Body:
 
     def solve(self, request: ViewRequest, settings: ViewSettings) -> Frame:
         """Return the frame of a request, computed by the simulator."""
-        simulator = self.simulator if settings.correction else self._uncorrected
-        answer = request.answer(simulator, settings.tol, settings.budget_ms)
+        answer = request.answer(self.simulator, settings.tol, settings.budget_ms)
         reference: Tensor | float = 0.0
         if settings.quantity == ERROR:
-            exact = request.answer(simulator, self.scene.solver.tol, warm=True)
+            exact = request.answer(self.simulator, self.scene.solver.tol, warm=True)
             if isinstance(exact, GraspAnswer) and exact.stopped:
                 raise ValueError(
                     f"colours: no finite-element solution of this grasp after "

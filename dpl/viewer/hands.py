@@ -56,8 +56,7 @@ class PullingHand(Hand):
             direction = np.pad((target / size).numpy(), (0, 3 - len(target)))
             controls.direction.value = tuple(direction.round(2).tolist())
         controls.follows_frame = True
-        limit, patch = None if controls.unlimited.value else 1.0, self._patch(self._node)
-        return self._request(partial(patch.force_towards, target, max_amplitude=limit))
+        return self._request(partial(self._patch(self._node).force_towards, target))
 
     def hold(self, node: int, frame: Frame | None) -> MakeRequest:
         """Return the load of the sliders for direction and amplitude."""
@@ -71,8 +70,7 @@ class PullingHand(Hand):
         return self._patch(node).node_mask
 
     def _patch(self, node: int) -> Patch:
-        controls = self._controls
-        return self._body.patch(node, controls.radius.value, uniform=controls.uniform.value)
+        return self._body.patch(node, self._controls.radius.value)
 
     def _request(self, make_force: Callable[[], Tensor]) -> MakeRequest:
         """Return the request of a dimensionless force (N, D), which the worker makes."""

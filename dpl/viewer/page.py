@@ -3,6 +3,8 @@
 import contextlib
 import io
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +18,13 @@ from dpl.viewer.controls import BAD, GOOD, GRASP, PULL, WARNING, Controls, probl
 from dpl.viewer.frames import Body, Frame
 from dpl.viewer.hands import GraspingHand, Hand, PullingHand
 from dpl.viewer.nodes import BodyNode, LoadMarker, LocalServer, add_environment
-from dpl.viewer.recording import SUFFIXES, Recording
+from dpl.viewer.recording import SUFFIXES, Recording, farthest_node, rotating_load
 from dpl.viewer.renderer import ColourScale
-from dpl.viewer.requests import MakeRequest
+from dpl.viewer.requests import LoadRequest, MakeRequest
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
 PICK_RADIUS = 0.02  # distance of a ray to the points that it may pick, beyond the nearest, over L
-
 SLOW = 1.0  # time of a solve from which the page shows it [s]
 
 
@@ -57,7 +58,8 @@ class Page:
         self.newton_frame: Frame | None = None
         self._error, self._changed = "", False
         self._make_request: MakeRequest = body.zero_load
-        self.node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
+        self.node = farthest_node(body)
+        self._rotating: Callable[[float], LoadRequest] | None = rotating_load(body)
         self._grabbed: Floats | None = None  # position of the mouse at the start of a drag
         self._n_samples = 0
         self.worker = Worker(body, self._show, self._show_newton, self._show_error)
@@ -74,7 +76,7 @@ class Page:
         self.placement = Placement.of(body, self.node, self.controls.radius.value)
         self._build_scene()
         self._connect()
-        self._mark_patch()
+        self._marker.mask = self._rotating(1.0).force.any(dim=1).numpy()[body.surface.nodes]
         self.worker.submit(settings=self.controls.settings())
         self.worker.start()
 
@@ -160,7 +162,7 @@ class Page:
 
     def apply_mode(self, event: Any = None) -> None:
         """Show the controls of the selected mode; the load or the grasp remains."""
-        self._grabbed = None
+        self._grabbed = self._rotating = None
         self._release()
         self.controls.show_mode()
         self._mark_patch()
@@ -184,10 +186,9 @@ class Page:
             self.controls.parameters[name].value = value
         self.controls.follows_frame = True
         self._release()
-        loaded = request.force.any(dim=1).numpy()[self.body.surface.nodes]
-        self.node = self.body.surface.middle_node(loaded)
         self._submit(lambda: request)
-        self._marker.mask = loaded
+        self._marker.mask = request.force.any(dim=1).numpy()[self.body.surface.nodes]
+        self.node = self.body.surface.middle_node(self._marker.mask)
 
     def reset(self, event: Any) -> None:
         """Remove the load and restore the default Young's modulus."""
@@ -247,11 +248,15 @@ class Page:
     # --- requests to the worker and its results
 
     def _submit(self, make_request: MakeRequest | None = None) -> None:
-        """Submit a request, or the last one, with the moduli of the sliders."""
-        make = self._make_request = make_request or self._make_request
-        sliders, young = self.controls.parameters, self.controls.modulus
-        parameters = {name: slider.value for name, slider in sliders.items()}
+        """Submit a request of the user, or the last one; it ends the rotation of the load."""
+        self._rotating = None
         self._mark_patch()  # first, so that it does not remove an error of this request
+        self._solve(make_request or self._make_request)
+
+    def _solve(self, make: MakeRequest) -> None:
+        """Submit a request with the moduli of the sliders."""
+        self._make_request, young = make, self.controls.modulus
+        parameters = {name: slider.value for name, slider in self.controls.parameters.items()}
         self.worker.submit(lambda: self.body.with_moduli(make(), young, parameters))
 
     def _mark_patch(self) -> None:
@@ -279,7 +284,12 @@ class Page:
         self._error, self._changed = text, True
 
     def refresh(self) -> None:
-        """Update the readings of the panel; to be called a few times per second."""
+        """Update the readings of the panel; to be called many times per second.
+
+        Until a user changes the load, it rotates while a browser shows the page.
+        """
+        if self._rotating and self.server.get_clients():
+            self._solve(partial(self._rotating, time.monotonic()))
         if (seconds := self.worker.solving_time) > SLOW:
             self.controls.show_problem(f"Solving for {seconds:.0f} s ...", WARNING)
             self._changed = True
@@ -289,7 +299,7 @@ class Page:
     def _show_readings(self, frame: Frame) -> None:
         """Show the readings of a frame, or why it cannot be used."""
         self._changed = False
-        self.controls.show_frame(frame, self._scale.top, self.worker.frame_rate, self.node)
+        self.controls.show_frame(frame, self._scale.top, self.node)
         self.controls.show_newton_frame(self.newton_frame, self.worker.settings.show_newton)
         has_budget = self.worker.settings.budget_ms is not None
         self.controls.show_problem(self._error or problem_of(frame, has_budget=has_budget))

@@ -24,14 +24,11 @@ class Patch:
         scene: The body and its loads.
         node: Node at the centre.
         radius: Radius over L [-].
-        uniform: Use equal forces on all nodes instead of modes, as for load families without
-            modes. The training contains no such loads.
     """
 
     scene: Scene
     node: int
     radius: float
-    uniform: bool = False
 
     @cached_property
     def node_mask(self) -> Tensor:
@@ -63,10 +60,13 @@ class Patch:
 
     @cached_property
     def unit_loads(self) -> Tensor:
-        """Loads of amplitude 1, of one mode or along one axis each, (M, N, D) [-]."""
+        """Loads of amplitude 1, of one mode or along one axis each, (M, N, D) [-].
+
+        Families without modes have equal forces on all nodes, which their training may not contain.
+        """
         loads = self.scene.loads
         loaded = self.node_mask[:, None] & loads.loadable_dofs
-        if self.uniform or not isinstance(loads, HasModes):
+        if not isinstance(loads, HasModes):
             size = loads.largest_force / float(loaded.any(dim=1).sum()) ** 0.5
             axes = torch.eye(loaded.shape[1], dtype=torch.float64)
             return torch.where(loaded, size * axes[:, None], 0.0)
@@ -81,19 +81,17 @@ class Patch:
             [linear.solve(load)[self.node] - without for load in self.unit_loads], dim=1
         )
 
-    def force_towards(self, displacement: Tensor, *, max_amplitude: float | None = 1.0) -> Tensor:
+    def force_towards(self, displacement: Tensor) -> Tensor:
         """Return the force (N, D) [-] whose linear response moves the centre by `displacement`.
 
         Of all such forces the one with the smallest amplitudes, by ridge regression; it is scaled
-        down to `max_amplitude` of a unit load. The displacement is over L, (D,) [-].
+        down to the size of a unit load. The displacement is over L, (D,) [-].
         """
         C = self.compliance
         square = C @ C.T
         ridge = RIDGE * square.diagonal().sum() * torch.eye(len(C), dtype=C.dtype)
         amplitudes = C.T @ torch.linalg.solve(square + ridge, displacement)
-        largest = float(amplitudes.abs().max())
-        if max_amplitude is not None and largest > max_amplitude:
-            amplitudes = amplitudes * (max_amplitude / largest)
+        amplitudes = amplitudes / max(float(amplitudes.abs().max()), 1.0)
         return torch.einsum("m,mnd->nd", amplitudes, self.unit_loads)
 
     def force_along(self, direction: Tensor, amplitude: float) -> Tensor:

@@ -3,7 +3,6 @@
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 
 from dpl.viewer.frames import Body, Frame, ViewSettings
@@ -52,7 +51,6 @@ class Worker(threading.Thread):
         self._make_request: MakeRequest = body.zero_load
         self._settings = ViewSettings()
         self._submitted, self._finished, self._stopped = 1, 0, False  # counts of requests
-        self._times: deque[float] = deque(maxlen=240)
         self._begin: float | None = None  # of the solve in progress [s]
 
     def submit(
@@ -69,12 +67,6 @@ class Worker(threading.Thread):
     def settings(self) -> ViewSettings:
         """The most recent settings."""
         return self._settings
-
-    @property
-    def frame_rate(self) -> float:
-        """Number of frames in the second before the last frame [1/s]."""
-        times = list(self._times)
-        return float(sum(times[-1] - then < 1.0 for then in times))
 
     @property
     def solving_time(self) -> float:
@@ -126,7 +118,6 @@ class Worker(threading.Thread):
             current = interpolate(current, goal, 1.0 if arrived else self._smoothing(start))
             self._begin = start = time.monotonic()
             frame = self.body.solve(current, settings)
-            self._times.append(time.monotonic())
             self._on_frame(frame)
             if current is goal:
                 break

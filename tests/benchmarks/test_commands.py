@@ -56,7 +56,7 @@ COMMANDS = {
     ),
     "grasps": (
         [UNROLLED, "count=2", "amplitudes=1"],
-        {"grasps.csv": ("method", ["network", "corrected", "hybrid to 1e-6"])},
+        {"grasps.csv": ("method", ["prediction", "corrected", "hybrid to 1e-6"])},
     ),
     "transfer": (["run=runs"], {"transfer.csv": ("trained_on", ["other", "tiny"])}),
     "error_estimates of runs": ([RUNS, "test=3"], {"error_estimates.csv": ("prediction", BOTH)}),

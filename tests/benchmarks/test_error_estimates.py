@@ -28,7 +28,7 @@ def test_errors_are_those_of_the_answers(scene, samples):
     assert [one.error for one in found] == pytest.approx([0.01] * 4, rel=1e-6)
     answer = Simulator(surrogate)(**scene.si_inputs(samples.load))
     assert [one.estimated for one in found] == pytest.approx(answer.error.tolist())
-    assert {one.method for one in found} == {"network"}
+    assert {one.method for one in found} == {"prediction"}
     better = list(measured(Simulator(surrogate), samples, {"tol": 1e-6}))
     assert all(one.error < 1e-5 for one in better)
 
@@ -48,7 +48,7 @@ def test_softened_bodies_are_stable_and_nearer_to_buckling_than_others():
 
 def test_quantiles_are_those_of_finite_ratios_of_each_group():
     ratios = np.linspace(1.0, 3.0, 21)
-    group = [Estimate("a", "b", "c", "", "network", 0.01, 0.01 * r) for r in ratios]
+    group = [Estimate("a", "b", "c", "", "prediction", 0.01, 0.01 * r) for r in ratios]
     lost = replace(group[0], estimated=math.inf)
     wrong = [replace(group[0], prediction="d", estimated=0.01 * part) for part in (0.2, 0.5)]
     exact = replace(group[0], error=0.0, estimated=1e-12)

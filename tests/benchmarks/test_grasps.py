@@ -43,7 +43,7 @@ def test_better_methods_have_smaller_errors(gripper, some):
     rows, unknown = grasps.measure(gripper, some)
     network, corrected, hybrid, newton = sorted(rows, key=lambda row: -row.rel_L2_median)
     assert unknown == 0
-    assert network.method == "network"
+    assert network.method == "prediction"
     assert corrected.method == "corrected"
     assert {hybrid.method, newton.method} == {"hybrid to 1e-6", grasps.NEWTON}
     assert corrected.motion_met == hybrid.motion_met == newton.motion_met == 100

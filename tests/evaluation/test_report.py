@@ -16,6 +16,7 @@ from dpl.evaluation.comparison import differing_options
 from dpl.evaluation.report import SolverResult, measure, save, show
 from dpl.fem import Load, Solution, evaluate_solution
 from dpl.fem import fields as nodal_stress
+from dpl.inference import Simulator
 from dpl.models import FCNN
 from dpl.training import MSE, RelativeL2, Surrogate
 
@@ -223,8 +224,10 @@ def test_hybrid_simulator_and_newton_answer_every_load(evaluated):
     assert linear.iterations == 1
 
 
-def test_each_row_has_the_median_of_the_estimated_errors(evaluated):
-    linear, *_, newton = evaluated[0]
+def test_each_row_has_the_median_of_the_estimated_errors(evaluated, surrogate, few):
+    linear, prediction, *_, newton = evaluated[0]
+    answer = Simulator(surrogate)(**surrogate.scene.si_inputs(few.load))
+    assert prediction.estimated_error == pytest.approx(float(np.median(answer.error)))
     error = linear.errors["rel_L2_median"]
     assert 0.5 * error < linear.estimated_error < 10 * error
     assert newton.estimated_error < 1e-6

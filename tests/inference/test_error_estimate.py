@@ -50,7 +50,7 @@ def test_a_network_without_modes_reports_its_error_within_a_factor_of_five(
     scene, forces, truth, part
 ):
     answer = simulator_of(scene, part)(forces)
-    assert answer.method == ["network"] * 4
+    assert answer.method == ["prediction"] * 4
     ratio = answer.error / errors_of(answer, scene, truth)
     assert (ratio > 0.5).all()
     assert (ratio < 5.0).all()
@@ -92,7 +92,7 @@ def test_a_tolerance_for_the_error_is_met_without_modes(scene, forces, truth, wa
     assert (answer.iterations <= exact.iterations).all()
     assert not answer.converged.all()
     near = simulator_of(scene, 1 + wanted / 10)(forces, error=wanted)
-    assert near.method == ["network"] * 4
+    assert near.method == ["prediction"] * 4
 
 
 def test_errors_outside_of_the_modes_are_corrected_where_they_are_large(scene, forces, truth):
@@ -239,7 +239,7 @@ def test_steps_in_modes_are_followed_by_the_hybrid_on_request_only(scene, forces
     newton = softest_mode(scene)
     sim = simulator_of(scene, 0.8, newton=newton)
     plain = sim(forces)
-    assert set(plain.method) <= {"network", "corrected"}
+    assert set(plain.method) <= {"prediction", "corrected"}
     assert (plain.error > 1e-3).any(), "one mode is too few"
     asked = sim(forces, error=1e-3)
     assert (asked.error <= 1e-3).all()

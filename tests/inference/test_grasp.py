@@ -125,7 +125,7 @@ def test_a_plate_holds_the_largest_flat_part_of_a_patch(scene):
 def test_a_network_finds_the_forces_of_a_sliding_patch(scene):
     found = simulator_of(scene, steps=0).grasp(END, [2.0, 0.0, 0.0], ROTATION, sliding=True)
     exact = simulator_of(scene).grasp(END, [2.0, 0.0, 0.0], ROTATION, sliding=True, tol=1e-9)
-    assert found.method == "network"
+    assert found.method == "prediction"
     assert found.motion_error < 1e-3 * L
     assert abs(found.force[0] - exact.force[0]) < 0.01 * abs(exact.force[0])
 
@@ -158,7 +158,7 @@ def test_the_gripper_balances_the_supports(scene, solved):
 
 def test_an_exact_network_meets_the_motion_and_has_the_reaction(scene, solved):
     found = simulator_of(scene, steps=0).grasp(END, TRANSLATION, ROTATION)
-    assert found.method == "network"
+    assert found.method == "prediction"
     assert found.forces_found
     assert not found.converged, "a motion that is met to a tolerance is no equilibrium"
     assert 0 < found.motion_error < 1e-3 * L
@@ -172,7 +172,7 @@ def test_an_exact_network_meets_the_motion_and_has_the_reaction(scene, solved):
 def test_a_correction_reduces_the_error_and_meets_the_motion(scene, solved, sim):
     network = simulator_of(scene, linear_network(scene), steps=0)
     raw, better = (one.grasp(END, TRANSLATION, ROTATION) for one in (network, sim))
-    assert (raw.method, better.method) == ("network", "corrected")
+    assert (raw.method, better.method) == ("prediction", "corrected")
     off = lambda one: np.linalg.norm(one.displacement - solved.displacement)  # noqa: E731
     assert off(better) < 0.1 * off(raw)
     assert better.motion_error < 1e-12 * L

@@ -13,7 +13,7 @@ def candidate(residual, error, volume_ratio=0.5, *, converged=False):
     """Return a solution of which only the numbers of the order are known."""
     numbers = {"residual": residual, "volume_ratio": volume_ratio, "converged": converged}
     state = SimpleNamespace(**{name: torch.tensor([one]) for name, one in numbers.items()})
-    return Candidate("network", state, error)
+    return Candidate("prediction", state, error)
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def test_a_tolerance_is_kept_and_the_answer_is_newtons(scene, forces, truth):
 
 def test_without_a_tolerance_the_network_answers_and_says_how_wrong_it_is(scene, forces, truth):
     answer = simulator_of(scene)(forces)
-    assert answer.method == ["network"] * 4
+    assert answer.method == ["prediction"] * 4
     assert torch.allclose(answer.displacement, 0.5 * truth)
     assert not answer.converged.any()
     assert not answer.iterations.any()
@@ -67,7 +67,7 @@ def test_without_a_tolerance_the_network_answers_and_says_how_wrong_it_is(scene,
 def test_an_exact_prediction_needs_no_iteration(scene, forces):
     sim = simulator_of(scene, lambda load: solve(scene.solver, load).displacement)
     answer = sim(forces, tol=1e-6)
-    assert answer.method == ["network"] * 4
+    assert answer.method == ["prediction"] * 4
     assert answer.converged.all()
     assert not answer.iterations.any()
 
@@ -152,6 +152,15 @@ def newton_everywhere(scene, **options):
     return SubspaceNewton(problem, vectors, **options)
 
 
+@pytest.mark.parametrize("has_modes", [False, True])
+def test_the_error_of_a_prediction_is_that_of_its_answer(scene, forces, loads, has_modes):
+    newton = newton_everywhere(scene, outside_error=1e-6) if has_modes else None
+    near = lambda load: 1.03 * solve(scene.solver, load).displacement  # noqa: E731
+    sim = simulator_of(scene, near, newton=newton, steps=0)
+    stated = list(map(sim.prediction_error, loads.unbatch(), near(loads).split(1)))
+    assert stated == pytest.approx(sim(forces).error.tolist())
+
+
 def test_steps_in_the_modes_follow_while_the_estimated_error_is_large(scene, forces, truth):
     near = lambda load: 1.03 * solve(scene.solver, load).displacement  # noqa: E731
     sim = simulator_of(scene, near, newton=newton_everywhere(scene, outside_error=1e-6))
@@ -160,7 +169,7 @@ def test_steps_in_the_modes_follow_while_the_estimated_error_is_large(scene, for
         return (answer.displacement - truth).flatten(1).norm(dim=1) / truth.flatten(1).norm(dim=1)
 
     found = [sim(forces, error=wanted) for wanted in (10.0, 0.01, 1e-5)]
-    assert found[0].method == ["network"] * 4
+    assert found[0].method == ["prediction"] * 4
     assert found[2].method == ["corrected"] * 4
     assert "corrected" in found[1].method
     assert (found[1].error <= 0.01 + 1e-6).all()
@@ -170,7 +179,7 @@ def test_steps_in_the_modes_follow_while_the_estimated_error_is_large(scene, for
     assert (found[0].iterations == 0).all()
     assert (found[2].iterations >= found[1].iterations).all()
     without = simulator_of(scene, near, newton=newton_everywhere(scene), steps=0)(forces)
-    assert without.method == ["network"] * 4
+    assert without.method == ["prediction"] * 4
     assert without.error.isfinite().all()
 
 
@@ -178,7 +187,7 @@ def test_a_step_that_makes_an_answer_worse_is_not_taken(scene, forces, truth):
     wrong = simulator_of(scene, lambda load: 30 * torch.randn(load.force.shape).double())
     sim = Simulator(wrong.surrogate, newton=newton_everywhere(scene))
     answer = sim(forces)
-    assert answer.method == ["network"] * 4
+    assert answer.method == ["prediction"] * 4
     assert (answer.error == torch.inf).all()
     assert all(words.startswith("NOT VALID") for words in answer.summary)
     assert sim(forces, tol=1e-6).converged.all()
@@ -204,12 +213,12 @@ def test_a_budget_ends_it_and_the_best_so_far_is_returned(scene, forces, clock):
         found.append(answer)
         # the prediction is always given; each reading of the clock takes 1 ms, two for an estimate
         assert answer.milliseconds < max(budget, 7) + 3.5
-        assert "network" in answer.method or answer.iterations > 0
+        assert "prediction" in answer.method or answer.iterations > 0
         assert not answer.converged or answer.iterations == whole.iterations
     counts = [answer.iterations for answer in found]
     assert counts == sorted(counts)
     assert counts[0] == 0
-    assert found[0].method == "network"
+    assert found[0].method == "prediction"
     assert len(set(counts)) >= 3
     assert found[-1].converged
     ended = [answer for answer in found if not answer.converged]
@@ -328,7 +337,7 @@ def test_a_wrong_answer_is_not_in_balance_because_of_forces_on_held_nodes(scene,
     force = torch.where(scene.problem.free, forces[0], 1e10)
     answer = simulator_of(scene, off)(force, tol=1e-6)
     assert answer.converged
-    assert answer.method != "network"
+    assert answer.method != "prediction"
     assert torch.allclose(answer.displacement, truth[0], rtol=0, atol=1e-5 * scene.length)
     alone = simulator_of(scene, off)(force)
     assert not alone.converged

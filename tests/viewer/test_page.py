@@ -18,6 +18,7 @@ from dpl.inference import Simulator
 from dpl.viewer import AccessPolicy, Body, Page
 from dpl.viewer.controls import GRASP, PULL
 from dpl.viewer.frames import QUANTITIES
+from dpl.viewer.recording import rotating_load
 from dpl.viewer.renderer import NEUTRAL
 from dpl.viewer.units import engineering
 
@@ -37,7 +38,7 @@ def pages(request, make_scene, make_body, tmp_path_factory):
     body, folder = make_body(make_scene(**BODIES[request.param])), tmp_path_factory.mktemp("page")
     page = Page(body, AccessPolicy.bind("127.0.0.1", 0), title="t", folder=folder)
     controls, node, radii = page.controls, page.node, dict(page.controls._radii)
-    switches = (controls.mode, controls.unlimited, *controls.of_load, *controls.of_moduli)
+    switches = (controls.mode, *controls.of_load, *controls.of_moduli)
     values = [(control, control.value) for control in (*switches, *controls.of_settings)]
     assert page.worker.wait(240)
 
@@ -83,7 +84,8 @@ def test_a_dragged_point_follows_the_mouse(page):
     assert tip[-1] == pytest.approx(0.08, rel=0.3)
     page.refresh()
     result, unit = page.controls._result.content, "N/m" if flat else "N"
-    assert "min det F" in result
+    assert result.index("estimated error") < result.index("total force")
+    assert "min det F" in page.controls._details.content
     assert engineering(float(frame.request.force.sum(dim=0).norm()), unit) in result
     assert engineering(float(frame.displacement[page.node].norm()), "m") in result
     assert "displacement [m]" in page.controls._legend.content
@@ -114,8 +116,9 @@ def test_a_grasped_patch_follows_the_mouse(page):
     units = ("N", "N m") if dim == 3 else ("N/m", "N")
     for vector, unit in zip((grasp.force, grasp.moment), units, strict=True):
         assert engineering(float(np.linalg.norm(vector)), unit) in result
-    assert engineering(grasp.motion_error, "m") in result
-    assert html.escape(grasp.summary) in result
+    details = page.controls._details.content
+    assert engineering(grasp.motion_error, "m") in details
+    assert html.escape(grasp.summary) in details
     assert page.controls._error.content == ""
     drag_tip(page, motion)
     moved = page.frame.displacement[held] / page.body.scene.length
@@ -147,7 +150,7 @@ def test_the_angle_rotates_a_grasped_patch(page):
 def test_each_mode_has_its_controls_and_its_radius(page):
     controls = page.controls
     planar = page.body.scene.problem.shape[1] == 2
-    of_pull = (controls.direction, controls.amplitude, controls.unlimited, controls.uniform)
+    of_pull = (controls.direction, controls.amplitude)
     controls.radius.value = 0.31
     for mode in (GRASP, PULL):
         select(page, mode)
@@ -368,9 +371,7 @@ def test_dots_lie_above_the_surface(page):
     assert (above > np.linalg.norm(points[marker.mask] - middle, axis=1)).all()
 
 
-def test_newtons_method_in_the_modes_is_offered_if_the_simulator_has_one(page, tmp_path):
-    assert not page.controls.correction.visible
-    assert not page.controls.settings().correction
+def test_predictions_are_corrected_in_the_modes_if_the_model_has_some(page, tmp_path):
     problem = page.body.scene.problem
     count = int(problem.free.sum())
     vectors = torch.zeros(*problem.shape, count, dtype=torch.float64)
@@ -380,15 +381,9 @@ def test_newtons_method_in_the_modes_is_offered_if_the_simulator_has_one(page, t
     policy = AccessPolicy.bind("127.0.0.1", 0)
     other = Page(Body(simulator), policy, title="t", folder=tmp_path)
     try:
-        assert other.controls.correction.visible
-        assert other.worker.settings.correction
         other.sample(None)
         assert other.worker.wait(240)
         assert other.frame.answer.method == "corrected"
-        other.controls.correction.value = False
-        other.apply_settings(None)
-        assert other.worker.wait(240)
-        assert other.frame.answer.method == "network"
     finally:
         other.close()
 
@@ -409,4 +404,23 @@ def test_a_frame_that_is_not_finite_is_shown_as_invalid(page, monkeypatch):
     page.sample(None)
     assert page.worker.wait(240)
     page.refresh()
-    assert "NOT VALID" in page.controls._result.content
+    assert "above 100 %" in page.controls._result.content
+    assert "NOT VALID" in page.controls._details.content
+
+
+@of_bodies(["hexahedra", "2D"])
+def test_a_load_rotates_while_a_browser_is_open_until_a_user_changes_it(page, monkeypatch):
+    monkeypatch.setattr(page, "_rotating", rotating_load(page.body))
+    rest = page.frame
+    page.refresh()
+    assert page.worker.wait(240)
+    assert page.frame is rest, "no browser, no computation"
+    monkeypatch.setattr(page.server, "get_clients", lambda: {0: None})
+    page.refresh()
+    assert page.worker.wait(240)
+    assert page.frame.request.force.any()
+    drag_tip(page, np.array([0.0, 0.05, 0.0]))
+    dragged = page.frame
+    page.refresh()
+    assert page.worker.wait(240)
+    assert page.frame is dragged

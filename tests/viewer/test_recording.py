@@ -1,6 +1,7 @@
 """Recordings contain the frames that were shown."""
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import meshio
 import numpy as np
@@ -8,8 +9,17 @@ import pytest
 import torch
 from PIL import Image
 
+from dpl.fem import PatchLoads
 from dpl.viewer.frames import ViewSettings
-from dpl.viewer.recording import FRAME_RATE, MAX_FRAMES, Recording, animate_load, resample
+from dpl.viewer.recording import (
+    DURATION,
+    FRAME_RATE,
+    MAX_FRAMES,
+    Recording,
+    animate_load,
+    resample,
+    rotating_load,
+)
 from dpl.viewer.renderer import Renderer
 
 
@@ -144,6 +154,21 @@ def test_the_camera_of_an_animation_shows_all_frames(body):
         pixels = renderer.camera.project(frame.points, 640, 360)
         assert (pixels[:, :2] > 0).all()
         assert (pixels[:, :2] < (640, 360)).all()
+
+
+@pytest.mark.parametrize("family", ["modes", "discs"])
+def test_the_rotating_load_is_in_the_training_range(scene, make_body, family):
+    if family == "discs":
+        discs = PatchLoads(scene.loads.linear, young=4500.0, deflection=0.1)
+        scene = replace(scene, loads=discs)
+    body = make_body(scene)
+    request_at = rotating_load(body)
+    frames = [body.solve(request_at(DURATION * k / 7), ViewSettings()) for k in range(1, 7)]
+    assert not any(frame.answer.out_of_distribution for frame in frames)
+    largest = max(float(frame.displacement.abs().max()) for frame in frames)
+    assert largest > 0.02 * body.scene.length
+    first, again = request_at(DURATION / 7).force, request_at(DURATION * 8 / 7).force
+    assert torch.allclose(again, first, atol=1e-9 * float(first.abs().max()))
 
 
 @pytest.mark.slow

@@ -1,11 +1,12 @@
 """A pneumatic finger: a block of hexahedra with a closed chamber."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import skfem
 
-from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.generators import grid
 from dpl.fem.mesh.regions import Box, facets_in
 
 
@@ -29,7 +30,9 @@ def finger(
     """
     if len(cells) != 3 or cells[0] < 3 or cells[1] < 3 or cells[2] < 4 or cells[2] % 2:
         raise ValueError(f"cells = {list(cells)} must be at least [3, 3, 4], the last one even")
-    block = box(size, [n + 1 for n in cells])
+    inside = math.prod((cells[0] - 3, cells[1] - 3, cells[2] // 2 - 2))  # nodes of the chamber
+    nodes = [n + 1 for n in cells]
+    block = grid({"hexahedron": skfem.MeshHex}, size, nodes, "hexahedron", unused=inside)
     cell = np.array(size, dtype=np.float64) / cells
     lower = cell * [1, 1, cells[2] // 2]
     upper = np.array(size) - cell

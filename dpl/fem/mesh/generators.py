@@ -32,7 +32,7 @@ def box(size: Sequence[float], nodes: Sequence[int], cell: str = "hexahedron") -
         MemoryError: The mesh would not fit in memory.
     """
     kinds = {"hexahedron": skfem.MeshHex, "tetra": skfem.MeshTet}
-    return _grid(kinds, size, nodes, cell)
+    return grid(kinds, size, nodes, cell)
 
 
 def rectangle(size: Sequence[float], nodes: Sequence[int], cell: str = "quad") -> skfem.Mesh:
@@ -48,12 +48,18 @@ def rectangle(size: Sequence[float], nodes: Sequence[int], cell: str = "quad") -
         MemoryError: The mesh would not fit in memory.
     """
     kinds = {"quad": skfem.MeshQuad, "triangle": skfem.MeshTri}
-    return _grid(kinds, size, nodes, cell)
+    return grid(kinds, size, nodes, cell)
 
 
-def _grid(
-    kinds: Mapping[str, type[skfem.Mesh]], size: Sequence[float], nodes: Sequence[int], cell: str
+def grid(
+    kinds: Mapping[str, type[skfem.Mesh]],
+    size: Sequence[float],
+    nodes: Sequence[int],
+    cell: str,
+    *,
+    unused: int = 0,
 ) -> skfem.Mesh:
+    """Return a mesh of a box with equal cells, of which the caller removes `unused` nodes."""
     if cell not in kinds:
         raise ValueError(f"cell = {cell!r} must be one of {', '.join(kinds)}")
     dim = kinds[cell].elem().dim
@@ -64,7 +70,7 @@ def _grid(
         raise ValueError(f"size = {list(size)} must have a ratio of at most {MAX_ASPECT:g}")
     if len(nodes) != dim or not all(n == int(n) and n >= 2 for n in nodes):
         raise ValueError(f"nodes = {list(nodes)} must be {dim} integers of at least 2")
-    refuse_mesh(math.prod(map(int, nodes)), "mesh.nodes")
+    refuse_mesh(math.prod(map(int, nodes)) - unused, "mesh.nodes")
     sides = [np.linspace(0.0, s, int(n)) for s, n in zip(size, nodes, strict=True)]
     mesh = kinds[cell].init_tensor(*sides)
     order = np.lexsort([mesh.p[axis] for axis in np.argsort(nodes, kind="stable")])
