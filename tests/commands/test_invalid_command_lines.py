@@ -27,8 +27,8 @@ NONSENSE = {  # command line -> what the one line says
     "generate model=fcnn": r"^Could not override 'model'",
     "train hydra/launcher=jobblib": r"'hydra/launcher/jobblib' .*pip install .*launch",
     "train hydra.swep.dir=3": r"^Could not override 'hydra\.swep\.dir'",
-    "train model.widht=3": r"^model\.widht: there is no such key; did you mean model\.width\?$",
-    "train model.nodes=3": r"^model\.nodes: .*FCNN has no such option; there are ",
+    "train model=fcnn model.widht=3": r"^model\.widht: .*; did you mean model\.width\?$",
+    "train model.nodes=3": r"^model\.nodes: .*Unrolled has no such option; there are ",
     "train trainer.max_epoch=3": r"did you mean trainer\.max_epochs\?$",
     "train callbacks.worst.every=3": r"^callbacks\.worst = {'every': 3} must be a call",
     "train mesh.cell=tetra": r"^Could not override 'mesh\.cell'\. .* use \+mesh\.cell=tetra",
@@ -42,7 +42,7 @@ NONSENSE = {  # command line -> what the one line says
     "train --config-name nowhere": r"^Cannot find primary config 'nowhere'",
     "train young=${nowhere}": r"^young: Interpolation key 'nowhere' not found$",
     f"train mesh=file mesh.path={BRACKET} fixed=tag fixed.name=wal": (
-        r"^fixed: Tag\(name='wal'\): the mesh has 'body', 'bore', 'seat', 'wall'"
+        r"^fixed: .*'wal'.*'body', 'bore', 'seat', 'wall'"
     ),
     "train run=null": r"^run = null must be a text",
     "train run=${nowhere}": r"^run = \$\{nowhere\} must be a text",
@@ -52,7 +52,7 @@ NONSENSE = {  # command line -> what the one line says
     "train -m run=file seed=1,2": r"^run = file cannot be written: File exists",
     "train -m seed=range(0)": r"^seed=range\(0\) must name one value or more",
     "train -m optimizer.lr=interval(1e-3,1)": r"^optimizer\.lr=interval.* is a range for a search",
-    "train -m model=fcnn,fcn": r"Could not find 'model/fcn'",
+    "train -m loss=mse,msee": r"Could not find 'loss/msee'",
     "train -m data.train=8,0": r"^data\.train = 0 must lie between",
     "train -m seed=0,1 optimizer.lr=1e-3,1e30": r"^optimizer\.lr = 1e\+30 must lie between",
     "train model.base=quadratic": r"^model\.base = 'quadratic' must be one of linear or null",
@@ -89,7 +89,7 @@ def ask(monkeypatch, tmp_path, folder_of):
 @pytest.mark.parametrize("line", NONSENSE)
 def test_a_command_line_that_cannot_work_is_refused_in_one_line(ask, capfd, tiny, line, tmp_path):
     command, *arguments = line.split()
-    small = [*tiny, "model.width=8"] if line.startswith("train -m") else []
+    small = [*tiny, "model=fcnn", "model.width=8"] if line.startswith("train -m") else []
     with pytest.raises(ConfigError, match=NONSENSE[line]) as refusal:
         ask(command, *arguments, *small)
     assert "\n" not in str(refusal.value)
@@ -104,7 +104,7 @@ def test_a_command_line_that_cannot_work_is_refused_in_one_line(ask, capfd, tiny
         "train",
         "train ~experiment ~hparams_search",
         "train experiment=beam_young",
-        "train +mesh.cell=tetra ++model.width=8",
+        "train +mesh.cell=tetra model=fcnn ++model.width=8",
         "train run=new/folder",
         "generate --cfg job young=-1",
     ],
@@ -132,7 +132,7 @@ def test_the_ends_of_the_ranges_of_a_search_are_checked(ask, monkeypatch, tmp_pa
     sweeper.write_text(f"_target_: other.Sweeper\n{params}\n")
     rehearsed = []
     monkeypatch.setitem(PARTS, "train", rehearsed.append)
-    search = ["-m", "--config-dir", "mine", "hydra/sweeper=other"]
+    search = ["-m", "--config-dir", "mine", "hydra/sweeper=other", "model=fcnn"]
     ask("train", *search)
     seen = [(job.optimizer.lr, job.model.width) for job in rehearsed]
     assert seen == [(1e-3, 2), (2e-2, 2), (1e-3, 6)]
@@ -191,11 +191,11 @@ def test_a_folder_that_is_read_only_is_refused(tmp_path):
         "train modle=fcnn",
         "train -m seed=range(0)",
         "train data.batch_size=0",
-        "train trainer.max_epochs=-1",
+        "train model=fcnn trainer.max_epochs=-1",
         "generate young=-1",
         "train run=/proc/nope",
         "train data.folder=/dev/null",
-        "train ~callbacks",
+        "train model=fcnn ~callbacks",
         "benchmark linear=[foo]",
         "benchmark linear=[]",
     ],

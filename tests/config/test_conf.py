@@ -216,12 +216,10 @@ def test_commands_share_the_sizes_of_the_data_set(compose):
 
 def test_the_default_is_the_main_job(compose):
     cfg = compose("folder=.", command="train")
-    assert cfg.mesh.nodes == [17, 5, 5]
+    assert cfg.mesh.nodes == [40, 10, 10]
     assert cfg.material._target_.endswith("NeoHookeanLn")
-    assert cfg.data.train == 1000
-    assert cfg.model._target_.endswith("FCNN")
-    assert cfg.loss._target_.endswith("LrStar")
-    assert cfg.data.test == 100
+    assert cfg.model._target_.endswith("Unrolled")
+    assert (cfg.data.train, cfg.data.test) == (256, 50)
 
 
 @pytest.mark.parametrize("name", options("debug"))

@@ -44,7 +44,7 @@ def make_surrogate(make, scene, seed=0, **options):
     network = (
         partial(make, **options) if make is not Unrolled else lambda *_: make(scene, **options)
     )
-    surrogate = Surrogate.from_network(network, MSE(), scene, **inputs)
+    surrogate = Surrogate.from_network(network, MSE(), scene, **{"base": None, **inputs})
     if surrogate.predictor.lacks_bases:
         load = scene.loads.sample((0, 1), range(8))
         truth = fem.solve(scene.solver, load).displacement
@@ -81,7 +81,7 @@ NETWORKS = {
     "gnn, edges": (GNN, {"width": 8, "levels": 1}, {"nodes": (9, 3, 3)}),
     "gnn, poisson": (GNN, {"width": 8}, {"poisson": [0.2, 0.4]}),
     "pod": (PODNet, {"rank": 8, "width": 16}, {}),
-    "fcnn, linear base": (FCNN, {"width": 16, "base": "linear"}, {}),
+    "fcnn, linear base": (FCNN, {"width": 16, "layers": 3, "base": "linear"}, {}),
     "pod, linear base": (
         PODNet,
         {"rank": 8, "width": 16, "base": "linear"},

@@ -84,7 +84,7 @@ FORBIDDEN = [  # suffix, content, message
         )
     ],
     # files of HDF5 can hold links to others
-    *[(suffix, HDF, "h5py|netCDF4") for suffix in ("h5m", "med", "cgns", "hmf", "e")],
+    *[(s, HDF, "h5py|netCDF4|cannot be read") for s in ("h5m", "med", "cgns", "hmf", "e")],
     # counts beyond the size of the file
     ("msh", GMSH2 + "$Nodes\n999999999999\n", "must hold one section"),
     ("msh", GMSH4 + "$Nodes\n1 999999999999 1 1\n", "must hold one section"),
@@ -95,7 +95,7 @@ HOSTILE = [
     ("vtu", LAUGHS + "<VTKFile>x</VTKFile>", "document type or entities"),
     ("vtu", DEEP, DAMAGED),
     ("vtu", DEEP + "</a>" * 10**5 + "</VTKFile>", DAMAGED),
-    ("xdmf", XDMF, "h5py|netCDF4"),
+    ("xdmf", XDMF, "h5py|netCDF4|cannot be read"),
     ("msh", GMSH2 + "$Nodes\n1000000\n1 0 0 0\n$EndNodes\n", DAMAGED),
     ("vtk", VTK + "UNSTRUCTURED_GRID\nPOINTS 99999999 double\n", DAMAGED),
     ("vtk", VTK + "UNSTRUCTURED_GRID\nCELL_TYPES 99999 double\n", DAMAGED),

@@ -22,8 +22,9 @@ def overrides(tiny_training):
     """The command line of a run of four epochs on the tiny scene."""
 
     def overrides(name, *more):
-        small = ["model=pod", "model.blocks=1", "model.coordinates=8", "data.folder=data"]
-        return [*tiny_training, *small, "trainer.max_epochs=4", f"run={name}", *more]
+        small = ["model=pod", "model.rank=100", "model.blocks=1", "model.coordinates=8"]
+        recipe = ["optimizer=muon", "loss=rmse", "data.symmetry=true", "data.folder=data"]
+        return [*tiny_training, *small, *recipe, "trainer.max_epochs=4", f"run={name}", *more]
 
     return overrides
 

@@ -146,7 +146,9 @@ def test_two_processes_share_one_stream(trained):
 
 def test_a_sweep_of_multi_process_runs_raises_an_error_with_the_remedy(script, tiny, tmp_path):
     sizes = ["data.workers=0", "data.train=4", "run=sweep"]
-    ended = script("train", "-m", "loss=mse,lr_star", *tiny, *sizes, *TWO, cwd=tmp_path)
+    ended = script(
+        "train", "-m", "model=fcnn", "loss=mse,lr_star", *tiny, *sizes, *TWO, cwd=tmp_path
+    )
     assert ended.status == 2
     *_, line = ended.err.strip().splitlines()
     assert line.startswith("error: trainer.strategy: with -m, ")
