@@ -22,7 +22,7 @@ def test_a_run_over_decades_of_moduli_is_resumed_loaded_evaluated_and_exported(
     lines = [*tiny_training, YOUNG, "model.young=true", "data.folder=data", "run=run"]
     assert script("train", *lines, "trainer.max_epochs=1", cwd=home).status == 0
     more = ["run=run", "ckpt_path=last", "trainer.max_epochs=2"]
-    resumed = script("train", *more, cwd=home)
+    resumed = script("train", *more, "extras.verbose=true", cwd=home)
     assert resumed.status == 0, resumed.err
     assert "E from 1e+06 to 1e+10 Pa, uniform in log E" in resumed.out
     other = script("train", *more, YOUNG.replace("log", "uniform"), cwd=home)

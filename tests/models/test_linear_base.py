@@ -7,7 +7,7 @@ import torch
 
 import dpl
 from dpl.fem import Load, rectangle, solve, symmetries
-from dpl.models import CNN, FCNN, GNN, Inputs, LinearBase, Unrolled
+from dpl.models import CNN, FCNN, GNN, Inputs, LinearBase
 from dpl.training import MSE, OnLinearSolution, RMSELoss, Scaled, Surrogate
 from dpl.training.linear_samples import LinearBatch, LinearSamples
 
