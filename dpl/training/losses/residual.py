@@ -13,13 +13,16 @@ from dpl.system.checks import check_range
 from dpl.training.losses.loss import Loss, LossContext, PrescribedGradient, squared_error
 from dpl.training.losses.supervised import MSE
 
+MAX_RESIDUALS = 64  # samples whose residual norms are averaged
+
 
 class LrStar(Loss):
     """L_r^* = error x ||R|| / ||Phi q_max||; the residual norm is a weight without gradient.
 
     As in the paper, the residual norm is averaged over the batch and scales the gradient of the
     whole batch. With `per_sample` it also weights the samples of a batch relative to each other.
-    The error of the paper is the mean squared one.
+    The error of the paper is the mean squared one. The mean of a large batch is that of at most
+    `MAX_RESIDUALS` of its samples.
     """
 
     saves = ("no backward pass through the residual: it is a constant weight",)
@@ -47,7 +50,9 @@ class LrStar(Loss):
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         error = self.error.errors(prediction, batch)
-        weight = residual_norm(prediction.detach().double(), batch, physics)
+        stride = 1 if self.per_sample else -(-len(prediction) // MAX_RESIDUALS)
+        some = Sample(*(column[::stride] for column in batch))
+        weight = residual_norm(prediction.detach()[::stride].double(), some, physics)
         if self.limit is not None:
             weight = weight.clamp(max=self.limit * weight.median())
         weight = weight if self.per_sample else weight.mean()
