@@ -206,8 +206,9 @@ def test_laws_with_fibres_converge_near_incompressibility(name):
     law, found = LAWS[name], []
     mu = law.mu.item()
     for ratio in (1e2, 1e5):
-        nearly = {"poisson": poisson(ratio)} if hasattr(law.matrix, "poisson") else {}
-        stiff = replace(law, matrix=replace(law.matrix, **(nearly or {"bulk": ratio * mu})))
+        has_bulk = vars(law.matrix).get("bulk") is not None
+        nearly = {"bulk": ratio * mu} if has_bulk else {"poisson": poisson(ratio)}
+        stiff = replace(law, matrix=replace(law.matrix, **nearly))
         problem = fem.Problem.build(
             fem.box([4.0, 1.0, 1.0], [5, 2, 2]),
             stiff,

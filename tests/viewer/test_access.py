@@ -256,7 +256,7 @@ def test_an_error_in_a_callback_prints_one_line(served, policy, capfd, monkeypat
     monkeypatch.setattr(served, "_submit", None)  # every call fails
     monkeypatch.setattr(served.worker, "submit", None)
     event = SimpleNamespace(client=object(), target=SimpleNamespace(value="VTU"))
-    of_load = "direction", "amplitude", "uniform", "radius", "axis", "angle"
+    of_load = "direction", "amplitude", "radius", "axis", "angle"
     for name in (*of_load, "young", "edges", "show_newton"):
         (callback,) = getattr(served.controls, name)._impl.update_cb
         callback(event)
