@@ -80,6 +80,7 @@ docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -f docs/make/mkdocs.yml
 
 pictures: runs/demo/evaluation.json
+	$(PIP) -e '.[pictures]'
 	$(BIN)/python docs/make/gallery.py
 	$(BIN)/python docs/make/executed.py
 	$(BIN)/python scripts/view.py run=runs/demo animation=docs/start.gif

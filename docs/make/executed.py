@@ -19,9 +19,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from images import small_png
 from paths import NOTEBOOKS, ROOT
 
+COLOURS = 256  # of the palette of a picture
 LONGEST = 1800  # seconds that a cell may take
 ANSI = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 ADDRESS = re.compile(r" at 0x[0-9a-f]+>")
@@ -104,12 +104,25 @@ def reduced(output: Any) -> Any:
     data = output.get("data", {})
     if "image/png" in data:
         with Image.open(io.BytesIO(base64.b64decode(data["image/png"]))) as image:
-            drawn = base64.b64encode(small_png(image)).decode()
+            drawn = base64.b64encode(_small_png(image)).decode()
         return v4.new_output("display_data", {"image/png": drawn})
     kind = next((kind for kind in KEPT if kind in data), None)
     if kind is None or not data[kind].strip() or ADDRESS.search(data[kind]):
         return None
     return v4.new_output("display_data", {kind: portable(data[kind])})
+
+
+def _small_png(image: Any) -> bytes:
+    """Return a picture of Pillow as PNG with a palette; transparent pixels become white."""
+    from PIL import Image
+
+    opaque = Image.new("RGBA", image.size, "white")
+    opaque.alpha_composite(image.convert("RGBA"))
+    method = Image.Quantize.MAXCOVERAGE  # keeps colours of small areas, such as ends of a scale
+    drawn = opaque.convert("RGB").quantize(COLOURS, method, 2, dither=Image.Dither.NONE)
+    made = io.BytesIO()
+    drawn.save(made, "PNG", optimize=True)
+    return made.getvalue()
 
 
 def portable(text: str) -> str:

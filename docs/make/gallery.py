@@ -14,19 +14,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from images import small_png
 from paths import DOCS
 
 PAGE = DOCS / "gallery.md"
 FOLDER = DOCS / "gallery"
 BLOCK = re.compile(
-    r"(?:^!\[(?P<title>[^\]]+)\]\(gallery/(?P<name>[\w-]+)\.png\)\n\n)?"
+    r"(?:^!\[(?P<title>[^\]]+)\]\(gallery/(?P<name>[\w-]+)\.webp\)\n\n)?"
     r"^```python\n(?P<code>.*?)^```$",
     re.M | re.S,
 )
 DPI = 150  # dots per inch of a picture
 SCREEN = 100  # dots per inch at which the site shows it
 MARGIN = 12  # white pixels around it
+QUALITY = 88  # of WebP, from 0 to 100
+DIGEST = 0x010E  # tag of Exif that contains the digest: a description
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,14 @@ class Entry:
         return hashlib.sha256((self.before + self.code).encode()).hexdigest()
 
     @property
+    def script(self) -> str:
+        """The code as a file that shows the picture."""
+        return f'"""{self.title}"""\n\n{self.before}\n{self.code}plt.show()\n'
+
+    @property
     def path(self) -> Path:
         """Path of the picture."""
-        return FOLDER / f"{self.name}.png"
+        return FOLDER / f"{self.name}.webp"
 
 
 def entries() -> list[Entry]:
@@ -92,7 +98,7 @@ def figures(names: Collection[str] | None = None) -> Iterator[tuple[Entry, Any]]
 
 
 def picture(figure: Any, digest: str) -> bytes:
-    """Return a figure as PNG without empty margins; it contains the digest as `code`."""
+    """Return a figure as WebP without empty margins; it contains the digest of its code."""
     from PIL import Image, ImageChops
 
     drawn = io.BytesIO()
@@ -102,7 +108,10 @@ def picture(figure: Any, digest: str) -> bytes:
     inside = image.crop(box)
     cut = Image.new("RGB", [side + 2 * MARGIN for side in inside.size], "white")
     cut.paste(inside, (MARGIN, MARGIN))
-    return small_png(cut, code=digest)
+    made, notes = io.BytesIO(), Image.Exif()
+    notes[DIGEST] = digest
+    cut.save(made, format="webp", quality=QUALITY, exif=notes)
+    return made.getvalue()
 
 
 def stored_digest(entry: Entry) -> str | None:
@@ -112,7 +121,7 @@ def stored_digest(entry: Entry) -> str | None:
     if not entry.path.is_file():
         return None
     with Image.open(entry.path) as image:
-        return image.info.get("code")
+        return image.getexif().get(DIGEST)
 
 
 def shown(text: str) -> str:
@@ -121,10 +130,12 @@ def shown(text: str) -> str:
 
     tiles = []
     for entry in entries():
-        tiles.append(f"[![](gallery/{entry.name}.png)<br>{entry.title}](#{entry.name})")
+        tile = f"[![](gallery/{entry.name}.webp)<br>{entry.title}](#{entry.name})"
+        tile += f" [code](gallery/{entry.name}.py){{ download }}"
+        tiles.append(f'<div markdown="span">{tile}</div>')
         with Image.open(entry.path) as image:
             width = image.width * SCREEN // DPI
-        link = f"![{entry.title}](gallery/{entry.name}.png)"
+        link = f"![{entry.title}](gallery/{entry.name}.webp)"
         text = text.replace(link, f"{link}{{ width={width} }}")
     grid = '<div class="tiles" markdown>\n\n' + "\n".join(tiles) + "\n\n</div>\n\n"
     head, first, rest = text.partition("# Gallery\n\n")
@@ -139,10 +150,11 @@ def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
+        Path("cad").symlink_to(DOCS / "cad")
         for entry, figure in figures():
             entry.path.write_bytes(picture(figure, entry.digest))
             print(f"{entry.path.name}: {entry.path.stat().st_size / 1e3:.0f} kB")
-    for path in {*FOLDER.glob("*.png")} - {entry.path for entry in entries()}:
+    for path in {*FOLDER.glob("*.webp")} - {entry.path for entry in entries()}:
         path.unlink()
 
 

@@ -50,6 +50,8 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         add(path, content)
     for path, content in executed.pages():
         add(path, content)
+    for entry in gallery.entries():
+        add(f"gallery/{entry.name}.py", entry.script)
     for path in sorted(RESULTS.iterdir()):
         add(f"results/{path.name}", path.read_bytes())
     for name in ("style.css", "favicon.svg", "iframe-worker.js"):
