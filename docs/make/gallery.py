@@ -131,7 +131,7 @@ def shown(text: str) -> str:
     tiles = []
     for entry in entries():
         tile = f"[![](gallery/{entry.name}.webp)<br>{entry.title}](#{entry.name})"
-        tile += f" [code](gallery/{entry.name}.py){{ download }}"
+        tile += f' <a href="gallery/{entry.name}.py" download>code</a>'
         tiles.append(f'<div markdown="span">{tile}</div>')
         with Image.open(entry.path) as image:
             width = image.width * SCREEN // DPI
