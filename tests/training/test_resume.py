@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from functools import partial
 from pathlib import Path
 
@@ -25,6 +26,7 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 
 from dpl.training import Surrogate, checkpoints
+from dpl.training.callbacks import checkpointing
 from dpl.training.checkpoints import read
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +92,7 @@ def killing(where, at):
     if where == "step":
         Surrogate.training_step = training_step
     else:
-        checkpoints.write, checkpoints.atomic_write = writing, half_file
+        checkpointing.write, checkpoints.atomic_write = writing, half_file
 
 
 def limiting(name, most):
@@ -102,7 +104,7 @@ def limiting(name, most):
             resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
         write(checkpoint, path)
 
-    checkpoints.write = full
+    checkpointing.write = full
 
 
 def mounting(folder):
@@ -188,6 +190,8 @@ def forked(elsewhere, overrides, home, monkeypatch):
                 runpy.run_path(str(ROOT / "scripts/train.py"), run_name="__main__")
             except SystemExit as end:
                 status = end.code or 0
+            except BaseException:
+                traceback.print_exc()
             finally:
                 sys.stderr.flush()
                 os._exit(status)
