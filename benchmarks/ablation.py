@@ -17,7 +17,7 @@ from dpl.fem import Material, ModalLoads
 from dpl.models import Unrolled
 from dpl.models.unrolled.features import SampleCells
 from dpl.system.threads import one_thread
-from dpl.training.metrics import default_metrics
+from dpl.training import ErrorMetrics
 
 Build = Callable[..., Unrolled]
 OTHER_STREAM = 7  # of loads far out of range and of local loads
@@ -217,6 +217,6 @@ def errors(net: Unrolled, samples: Sample) -> dict[str, Any]:
 
 
 def _metrics(net: Unrolled, predicted: Tensor, samples: Sample) -> dict[str, float]:
-    metrics = default_metrics(net.scene.problem)
+    metrics = ErrorMetrics(net.scene.problem)
     metrics.update(predicted, samples)
     return {name: float(value) for name, value in metrics.compute().items()}

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.ablation import ABLATION, CURVE, Row
-from benchmarks.study import picture
+from benchmarks.study import METHOD_COLOURS, picture
 from dpl import Sample
 from dpl.models import Unrolled
-from dpl.visualization import COLOURS, METHOD_COLOURS, draw_body
+from dpl.visualization import COLOURS, draw_body
 
 COLOUR = METHOD_COLOURS["unrolled"]
 

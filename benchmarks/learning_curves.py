@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.paper_tables import PLAIN
-from benchmarks.study import picture
+from benchmarks.study import method_colours, picture
 from dpl.evaluation.tables import write
-from dpl.visualization import method_colours
 
 ERROR = "val/rel_L2_median"
 CSV_LOG = Path("csv", "metrics.csv")  # see conf/logger/csv.yaml

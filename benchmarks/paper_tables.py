@@ -9,15 +9,13 @@ from torch import Tensor
 
 from benchmarks.methods import Method
 from benchmarks.samples import solved
-from benchmarks.study import picture
+from benchmarks.study import method_colours, picture
 from benchmarks.tables import read
 from dpl import Sample, Scene
 from dpl.evaluation import latency
 from dpl.fem import Load, Newton
 from dpl.system.threads import one_thread
-from dpl.training import RelativeL2
-from dpl.training.metrics import default_metrics
-from dpl.visualization import method_colours
+from dpl.training import ErrorMetrics, relative_errors
 
 # Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples. Experiments 3
 # and 3b differ in the range of Young's modulus, on which only networks with E as an input depend.
@@ -133,7 +131,7 @@ def measure(
                 answer = torch.cat([method.predict(load) for load in singles])
                 taken = latency(method.predict, singles, repeats=repeats)
                 iterations = None if title in STREAMS else _iterations(newton, singles, answer)
-                errors = default_metrics(newton.problem)
+                errors = ErrorMetrics(newton.problem)
                 errors.update(answer, batch)
                 known = {field.name for field in fields(Result)}
                 numbers = {k: float(v) for k, v in errors.compute().items() if k in known}
@@ -150,7 +148,7 @@ def measure(
                     newton_iterations=iterations,
                     **numbers,
                 )
-                yield row, RelativeL2().measure(answer, batch)
+                yield row, relative_errors(answer, batch)
 
 
 def _iterations(newton: Newton, loads: Sequence[Load], guesses: Tensor) -> float:

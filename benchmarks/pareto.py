@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from benchmarks.study import picture
+from benchmarks.study import method_colours, picture
 from dpl.evaluation.timing import WARM_UP, percentiles
 from dpl.fem import Load, Solution, Solver, solve
 from dpl.scene import Sample
 from dpl.system.threads import one_thread
-from dpl.training import RelativeL2, TrainedSurrogate
+from dpl.training import TrainedSurrogate, relative_errors
 from dpl.training.metrics import median
-from dpl.visualization import method_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -113,7 +112,7 @@ def points(
                 iterates = [states[min(k, len(states) - 1)] for states in paths]
                 times = torch.tensor([ms for ms, _ in iterates], dtype=torch.float64)
                 displacement = torch.cat([state.displacement for _, state in iterates])
-                error = RelativeL2().measure(displacement, batch)
+                error = relative_errors(displacement, batch)
                 residual = torch.cat([state.residual for _, state in iterates])
                 record = name, k, k == count - 1, threads, "cpu", len(singles)
                 errors = float(median(error)), float(error.max()), float(median(residual))

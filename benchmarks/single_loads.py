@@ -10,7 +10,7 @@ from torch import Tensor
 from dpl import Sample, Scene
 from dpl.inference.hybrid import Predict
 from dpl.system.threads import one_thread
-from dpl.training.metrics import MaxError, MeanError, MinSNR, RelativeL2
+from dpl.training import metrics
 from dpl.visualization import plot_deformed
 
 # Odot, Haferssas, Cotin (2022), tables 2, 4 and 6: e_mean, e_max, SNR [dB]
@@ -83,13 +83,18 @@ def measure(
     """
     single = Sample(*(column[load : load + 1] for column in test))
     deflection = float(largest_displacements(single))
-    metrics = MeanError(), MaxError(), MinSNR(), RelativeL2()
+    errors = (
+        metrics.mean_errors,
+        metrics.largest_errors,
+        metrics.signal_to_noise,
+        metrics.relative_errors,
+    )
     rows, displacements = [], {}
     with one_thread(), torch.inference_mode():
         for name, predict in predictions.items():
             found = displacements[name] = predict(single.load)
-            errors = (float(metric.measure(found, single)) for metric in metrics)
-            rows.append(SingleLoad(name, load, deflection, *errors))
+            numbers = (float(error(found, single)) for error in errors)
+            rows.append(SingleLoad(name, load, deflection, *numbers))
     return rows, displacements
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from benchmarks.discretisation import BEAM, YOUNG
-from benchmarks.study import picture
+from benchmarks.study import method_colours, picture
 from dpl import Sample, Scene
 from dpl.evaluation import latency
 from dpl.fem import LinearSolver, Load, ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, solve
@@ -22,7 +22,6 @@ from dpl.fem.linear import select_backend
 from dpl.models import FCNN, Unrolled
 from dpl.system.threads import one_thread
 from dpl.training import MSE, Surrogate
-from dpl.visualization import method_colours
 
 
 @dataclass(frozen=True)

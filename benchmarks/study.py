@@ -1,5 +1,6 @@
 """What all studies do with their rows: write, print and draw them."""
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -7,13 +8,30 @@ from typing import TYPE_CHECKING, TypeVar
 
 from benchmarks.tables import read, write_machine
 from dpl.evaluation.tables import show, write
-from dpl.visualization import DPI, STYLE
+from dpl.visualization import COLOURS, DPI, STYLE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Row = TypeVar("Row")
 Draw = Callable[[Sequence[Row], Path], None]
+METHOD_COLOURS = {  # a method has the same colour in all figures
+    "Newton": "0.1",
+    "linear": "0.5",
+    "unrolled": COLOURS[0],
+    "fcnn": COLOURS[1],
+    "pod": COLOURS[2],
+    "cnn": COLOURS[3],
+    "gnn": COLOURS[4],
+    "POD-Galerkin": COLOURS[5],
+}
+OTHER_COLOURS = ("#7F3C8D", "#A5AA99", "#80BA5A", "#E73F74")  # of methods without an own colour
+
+
+def method_colours(names: Iterable[str]) -> dict[str, str]:
+    """Return the colours of methods by name: those of `METHOD_COLOURS`, else further ones."""
+    others = itertools.cycle(OTHER_COLOURS)
+    return {name: METHOD_COLOURS.get(name) or next(others) for name in names}
 
 
 def record(

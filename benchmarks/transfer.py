@@ -13,7 +13,7 @@ from dpl.evaluation.tables import share
 from dpl.inference import default_hybrid
 from dpl.inference.hybrid import Predict
 from dpl.system.threads import one_thread
-from dpl.training.metrics import MinSNR, RelativeL2, median
+from dpl.training.metrics import median, relative_errors, signal_to_noise
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,14 @@ def measure(
     for family, test in tests.items():
         with one_thread(), torch.inference_mode():
             found = torch.cat([predict(load) for load in test.load.unbatch()])
-            errors = RelativeL2().measure(found, test)
+            errors = relative_errors(found, test)
             *_, solved = hybrid.iterate(test.load)
         done = solved.converged
         yield Transfer(
             *(network, trained_on, family, len(errors)),
             rel_L2_median=float(median(errors)),
             rel_L2_worst=float(errors.max()),
-            SNR_min=float(MinSNR().measure(found, test).min()),
+            SNR_min=float(signal_to_noise(found, test).min()),
             converged=100 * float(done.double().mean()),
             hybrid_iterations=float(solved.iterations[done].double().mean()),
             newton_iterations=newton[family],

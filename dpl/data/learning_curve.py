@@ -19,7 +19,7 @@ class CurvePoint(NamedTuple):
         seconds: Wall time since the start of the training [s].
         median: Median over held-out loads of the relative L2 error [-].
         worst: Largest relative L2 error [-].
-        e_mean: See `dpl.training.MeanError` [-].
+        e_mean: See `dpl.training.metrics.METRICS` [-].
     """
 
     loads: int

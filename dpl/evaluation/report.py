@@ -18,8 +18,8 @@ from dpl.evaluation.tables import (
     TOLS,
     error_row,
     newton_row,
+    percent,
     power,
-    share,
     show_cells,
     simulator_row,
 )
@@ -38,8 +38,7 @@ from dpl.fem import (
 from dpl.inference import Answer, Corrected, Direct, Hybrid, Simulator
 from dpl.scene import Sample, Scene
 from dpl.system.threads import one_thread
-from dpl.training import RelativeL2, TrainedSurrogate
-from dpl.training.metrics import default_metrics
+from dpl.training import ErrorMetrics, TrainedSurrogate, relative_errors
 from dpl.visualization import plot_deformed
 
 ERRORS = (1e-3,)  # estimated relative errors of the simulator [-]
@@ -86,7 +85,7 @@ def measure(
     """
     timed, rows = time_interleaved(solvers, batch.load), []
     for name, (solution, times) in timed.items():
-        errors = default_metrics(problem)
+        errors = ErrorMetrics(problem)
         errors.update(solution.displacement, batch)
         numbers = {key: float(value) for key, value in errors.compute().items()}
         iterations = solution.iterations.double()
@@ -97,20 +96,21 @@ def measure(
 
 
 def show(rows: Sequence[SolverResult], title: str) -> None:
-    """Print the most important numbers of rows as a table."""
+    """Print the most important numbers of rows as a table of at most 100 columns."""
     columns = (
-        "", "median error", "worst error", "estimated error", "residual", "converged",
-        "linear solves", "ms p50", "ms p99",
+        "", "median [%]", "worst [%]", "e_mean", "e_max", "SNR [dB]", "esti- mated [%]", "residual",
+        "con- verged", "linear solves", "ms p50", "ms p99",
     )  # fmt: skip
     cells = []
     for row in rows:
         e = row.errors
         cells.append([
-            row.solver, share(e["rel_L2_median"]), share(e["rel_L2_worst"]),
-            share(row.estimated_error), f"{e['residual']:.1e}", f"{row.converged}/{row.loads}",
-            f"{row.iterations:.1f}", f"{row.ms:.1f}", f"{row.ms_p99:.1f}",
+            row.solver, percent(e["rel_L2_median"]), percent(e["rel_L2_worst"]),
+            f"{e['e_mean']:.1e}", f"{e['e_max']:.1e}", f"{e['SNR_min']:.0f}",
+            percent(row.estimated_error), f"{e['residual']:.1e}", f"{row.converged}/{row.loads}",
+            f"{row.iterations:.1f}", *(f"{ms:.{int(ms < 100)}f}" for ms in (row.ms, row.ms_p99)),
         ])  # fmt: skip
-    show_cells(title, columns, cells)
+    show_cells(title, columns, cells, space=1)
 
 
 def save(rows: Sequence[SolverResult], path: Path) -> None:
@@ -168,7 +168,8 @@ def evaluate(
     rows = [replace(row, estimated_error=medians[row.solver]) for row in rows]
     latency = latencies(simulator, test.load)
     rows = [replace(row, latency=latency) if row.solver == PREDICTION else row for row in rows]
-    show(rows, f"{len(test.force)} test loads, one at a time, 1 thread; errors are relative L2")
+    about = "one at a time, 1 thread; median, worst and estimated error are relative L2"
+    show(rows, f"{len(test.force)} test loads, {about}")
     print(describe(latency))
     save(rows, folder / "evaluation.json")
     _draw(surrogate, test, displacements, folder)
@@ -251,7 +252,7 @@ def _draw(
     The file has the fields of `nodal_fields`, with the test solution as the reference.
     """
     scene, network = surrogate.scene, displacements[PREDICTION]
-    error = RelativeL2().measure(network, test)
+    error = relative_errors(network, test)
     order = error.argsort()
     chosen = order[[0, (len(order) - 1) // 2, -1]]  # of two middle loads the one with less error
     names = [

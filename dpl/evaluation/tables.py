@@ -44,14 +44,17 @@ def show(rows: Sequence[Any], title: str) -> None:
     show_cells(title, columns, cells)
 
 
-def show_cells(title: str, columns: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:
+def show_cells(
+    title: str, columns: Sequence[str], *sections: Sequence[Sequence[str]], space: int = 2
+) -> None:
     """Print rows of text with lines between sections; the first column is aligned to the left.
 
     Words of a title stand below each other, so that columns are as narrow as their numbers.
+    `space` is the number of characters between columns.
     """
     table = Table(
         title=escape(title) or None, title_justify="left", title_style="", box=box.SIMPLE_HEAD,
-        pad_edge=False, padding=(0, 1, 0, 0),
+        pad_edge=False, padding=(0, space - 1, 0, 0),
     )  # fmt: skip
     for number, column in enumerate(columns):
         words = column.replace(" ", "\n") if number else column
@@ -80,11 +83,15 @@ def newton_row(tol: float) -> str:
 
 def share(number: float) -> str:
     """Return a relative number in percent with two digits, in powers of ten below 0.001 %."""
-    if not 1e-5 <= number < math.inf:
+    return f"{percent(number)} %" if 1e-5 <= number < math.inf else f"{number:.0e}"
+
+
+def percent(number: float) -> str:
+    """Return 100 times a relative number with two digits, with one digit below 0.001."""
+    number = 100 * number
+    if not 1e-3 <= number < math.inf:
         return f"{number:.0e}"
-    percent = 100 * number
-    digits = max(0, 1 - math.floor(math.log10(percent)))
-    return f"{percent:.{digits}f} %"
+    return f"{number:.{max(0, 1 - math.floor(math.log10(number)))}f}"
 
 
 def power(number: float) -> str:

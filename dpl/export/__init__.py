@@ -6,7 +6,7 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.export.comparison import compare_outputs
-    from dpl.export.folder import read_metadata, read_reference, verify_folder, write_folder
+    from dpl.export.folder import read_metadata, read_reference, write_folder
     from dpl.export.onnx_graph import ExportGraph, OnnxSession, export_onnx, onnx_opset
     from dpl.export.paraview import write_results
 else:

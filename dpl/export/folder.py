@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from dpl.export.metadata import FORMAT
 from dpl.export.onnx_graph import Array
@@ -58,20 +57,12 @@ def write_raw(path: Path, field: Array) -> None:
 
 
 def read_raw(path: Path, shape: list[int]) -> Array:
-    """Return an array that `write_raw` wrote.
-
-    Raises:
-        ValueError: The size of the file does not fit the shape.
-    """
+    """Return an array that `write_raw` wrote; raise ValueError if its size is not the shape's."""
     return np.fromfile(path, dtype=RAW).astype(np.float64).reshape(shape)
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:
-    """Return the contents of meta.json.
-
-    Raises:
-        ValueError: The file has another format version.
-    """
+    """Return the contents of meta.json; raise ValueError if it has another format version."""
     meta: dict[str, Any] = json.loads((folder / "meta.json").read_text())
     if meta.get("format") != FORMAT:
         raise ValueError(
@@ -88,24 +79,3 @@ def read_reference(folder: Path) -> dict[str, Array]:
         name: read_raw(folder / "reference" / f"{name}.f64", shape)
         for name, shape in shapes.items()
     }
-
-
-def verify_folder(
-    folder: Path,
-    surrogate: TrainedSurrogate,
-    reference: Mapping[str, Array],
-    meta: Mapping[str, Any],
-) -> None:
-    """Read all files back and compare them bit for bit with the data.
-
-    Raises:
-        ValueError: A file differs.
-    """
-    weights = checkpoints.read(folder / "weights.safetensors")["state_dict"]
-    same = {"meta.json": read_metadata(folder) == json.loads(json.dumps(meta))}
-    for name, field in read_reference(folder).items():
-        same[f"reference/{name}.f64"] = np.array_equal(field, reference[name])
-    for name, tensor in surrogate.state_dict().items():
-        same[f"weights.safetensors: {name}"] = torch.equal(weights[name], tensor)
-    if changed := [name for name, is_same in same.items() if not is_same]:
-        raise ValueError(f"{folder / changed[0]} differs from what was written")

@@ -63,7 +63,6 @@ class CNN(nn.Module):
             memory_limit: Memory for training on one sample [GB]; None for that of the machine.
 
         Raises:
-            ValueError: `channels`, `steps` or `grid` is out of range.
             MemoryError: Parameters and one sample would not fit.
         """
         super().__init__()
@@ -229,11 +228,7 @@ def _means(field: Tensor, stride: tuple[int, ...]) -> Tensor:
 
 
 def _sizes(shape: tuple[int, ...], steps: int | None) -> list[tuple[int, ...]]:
-    """Return the sides of the grids, from the finest to the coarsest.
-
-    Raises:
-        ValueError: `steps` is negative or more than there are cells for.
-    """
+    """Return the sides of the grids, from the finest to the coarsest."""
     if steps is not None and steps < 0:
         raise ValueError(f"steps = {steps} must be 0 or more")
     sizes = [shape]

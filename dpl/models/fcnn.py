@@ -10,7 +10,6 @@ from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
 MAX_LAYERS = 1000
-NEARLY_LINEAR = 0.7  # slope of negative inputs at the start of a network on the linear solution
 
 
 class FCNN(nn.Module):
@@ -36,6 +35,7 @@ class FCNN(nn.Module):
         layers: int = 4,
         width: int | None = None,
         all_dofs: bool = False,
+        slope: float = 0.25,
         memory_limit: float | None = None,
     ) -> None:
         """Build the network.
@@ -46,10 +46,11 @@ class FCNN(nn.Module):
             layers: Number of linear layers, 2 or more.
             width: Units of the hidden layers; None for the number of outputs.
             all_dofs: Use all degrees of freedom as inputs and outputs, as in the paper.
+            slope: Slope at negative inputs at the start of the training. A network on the linear
+                solution learns faster if its units are nearly linear at first.
             memory_limit: Memory for training [GB]; None for that of the machine.
 
         Raises:
-            ValueError: `layers` or `width` is out of range.
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
@@ -72,7 +73,6 @@ class FCNN(nn.Module):
         self.register_buffer("outputs", outputs, persistent=False)
         for name, mask in {"input_index": read, "output_index": outputs}.items():
             self.register_buffer(name, mask.flatten().nonzero()[:, 0], persistent=False)
-        slope = NEARLY_LINEAR if inputs.is_displacement else 0.25
         stages: list[nn.Module] = [nn.Linear(sizes[0], sizes[1])]
         for before, after in pairwise(sizes[1:]):
             stages += [nn.PReLU(before, slope), nn.Linear(before, after)]

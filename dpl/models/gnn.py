@@ -55,7 +55,6 @@ class GNN(nn.Module):
             passes: Number of V-cycles.
 
         Raises:
-            ValueError: `width`, `levels` or `passes` is out of range.
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()

@@ -13,9 +13,9 @@ class Inputs(NamedTuple):
     """Sizes of the inputs (field, scalars) of a network.
 
     Without a base the field is a nodal force over its usual size. With `base = "linear"` it is a
-    whitened linear solution, see `LinearBase`. The scalars are, in this order: Young's modulus if
-    `young`, the amplitude of the linear solution with a base, and a column for each range of the
-    body (`LoadFamily.parameter_ranges`).
+    whitened linear solution, see `OnLinearSolution`. The scalars are, in this order: Young's
+    modulus if `young`, the amplitude of the linear solution with a base, and a column for each
+    range of the body (`LoadFamily.parameter_ranges`).
 
     Attributes:
         dofs: Degrees of freedom at which the field is not zero, (N, D).

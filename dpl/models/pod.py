@@ -75,7 +75,6 @@ class PODNet(nn.Module):
             blocks: Number of residual blocks, each of two layers.
 
         Raises:
-            ValueError: A number is out of range.
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()

@@ -13,22 +13,14 @@ if TYPE_CHECKING:
     )
     from dpl.training.callbacks.nonfinite_gradients import Diverged, SkipNonFiniteGradients
     from dpl.training.callbacks.tensorboard import LogHyperparameters, LogLearningRate
-    from dpl.training.callbacks.throughput import ThroughputMonitor
-    from dpl.training.callbacks.training_time import TrainingTime
+    from dpl.training.callbacks.throughput import ThroughputMonitor, TrainingTime
     from dpl.training.callbacks.worst_cases import WorstCasePlots
     from dpl.training.closed_form import fit
     from dpl.training.losses.energy import EnergyNormLoss, PotentialEnergyLoss
     from dpl.training.losses.loss import BlendedLoss, Loss, LossContext
     from dpl.training.losses.residual import LrPlus, LrStar
     from dpl.training.losses.supervised import MSE, RMSELoss
-    from dpl.training.metrics import (
-        MaxError,
-        MeanError,
-        MinSNR,
-        MinVolumeRatio,
-        RelativeL2,
-        ResidualRatio,
-    )
+    from dpl.training.metrics import ErrorMetrics, relative_errors
     from dpl.training.muon import Muon
     from dpl.training.predictors import Fitted, OnLinearSolution, Predictor, Scaled
     from dpl.training.schedules import warmup_cosine

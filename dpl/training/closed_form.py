@@ -16,13 +16,13 @@ from dpl.data.datamodule import DataModule
 from dpl.models.protocols import ClosedFormFit
 from dpl.training import checkpoints
 from dpl.training.callbacks.tensorboard import LogHyperparameters
-from dpl.training.callbacks.throughput import resident_memory
-from dpl.training.callbacks.training_time import TrainingTime
+from dpl.training.callbacks.throughput import TrainingTime, resident_memory
 from dpl.training.callbacks.worst_cases import WorstCasePlots
+from dpl.training.metrics import ErrorMetrics
 from dpl.training.surrogate import Surrogate
 
 # metrics of a learning curve, by their names there
-METRICS = {"median": "rel_L2_median", "worst": "rel_L2_worst", "e_mean": "e_mean"}
+OF_CURVE = {"median": "rel_L2_median", "worst": "rel_L2_worst", "e_mean": "e_mean"}
 OBSERVERS = (LogHyperparameters, TrainingTime, WorstCasePlots)
 
 
@@ -47,7 +47,7 @@ def fit(
         folder: Folder of the run, for checkpoints that `dpl.load` reads; None: none are written.
 
     Returns:
-        The smallest `MeanError` of the fits on the validation samples [-]; infinite if no error is
+        The smallest e_mean of the fits on the validation samples [-]; infinite if no error is
         finite.
 
     Raises:
@@ -77,10 +77,10 @@ def fit(
                 data.sizes |= sizes
                 net.fit(data.samples("train"), data.samples("val"))
                 errors = validation_errors(surrogate, data)
-                curve = {name: errors[f"val/{metric}"] for name, metric in METRICS.items()}
+                curve = {name: errors[f"val/{metric}"] for name, metric in OF_CURVE.items()}
                 print(data.source.record(sizes["train"], curve), flush=True)
                 numbers = {**errors, "epoch": step, "memory/process": resident_memory()}
-                points = {f"learning_curve/{m}": errors[f"val/{m}"] for m in METRICS.values()}
+                points = {f"learning_curve/{m}": errors[f"val/{m}"] for m in OF_CURVE.values()}
                 for logger in loggers:
                     logger.log_metrics(numbers, step=step)
                     logger.log_metrics(points, step=sizes["train"])
@@ -101,15 +101,15 @@ def fit(
 
 def validation_errors(surrogate: Surrogate, data: DataModule) -> dict[str, float]:
     """Return the metrics `val/NAME` and the mean loss `loss/val` on the validation samples."""
-    metrics, loss, count = surrogate.eval().val_metrics, 0.0, 0
-    metrics.reset()
+    metrics, loss, count = ErrorMetrics(surrogate.scene.problem), 0.0, 0
+    surrogate.eval()
     with torch.no_grad():
         for batch in data.val_dataloader():
             prediction, size = surrogate.predict(batch.load), len(batch.force)
             metrics.update(prediction, batch)
             loss += size * float(surrogate.loss(prediction, batch, surrogate.physics))
             count += size
-    found = {name: float(value) for name, value in metrics.compute().items()}
+    found = {f"val/{name}": float(value) for name, value in metrics.compute().items()}
     return {**found, "loss/val": loss / count}
 
 

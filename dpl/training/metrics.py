@@ -1,6 +1,4 @@
-"""Error metrics of predicted displacements: the three of the paper and five others.
-
-Every metric is updated with (prediction, batch): displacements over L, (B, N, D), and a `Sample`.
+"""Errors of predicted displacements: the three measures of the paper and others.
 
 Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 3.1.
 """
@@ -10,7 +8,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric, MetricCollection
+from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
 from dpl.fem import Problem
@@ -28,153 +26,84 @@ def median(values: Tensor) -> Tensor:
     return (values.median(dim=0).values - (-values).median(dim=0).values) / 2
 
 
-class _PerLoad(Metric):
-    """Base class: stores one number per load and reduces them in `compute`.
+def mean_errors(prediction: Tensor, batch: Sample) -> Tensor:
+    """Return ||u - v|| over the number of degrees of freedom, (B,) [-].
+
+    It decreases like the inverse root of that number under refinement and must not be compared
+    across meshes.
+    """
+    return _norm(prediction - batch.displacement) / prediction[0].numel()
+
+
+def relative_errors(prediction: Tensor, batch: Sample) -> Tensor:
+    """Return ||u - v|| / ||v||, (B,) [-], of displacements u, (B, N, D)."""
+    return _norm(prediction - batch.displacement) / _norm(batch.displacement)
+
+
+def largest_errors(prediction: Tensor, batch: Sample) -> Tensor:
+    """Return the largest nodal error ||u - v|| over L, (B,) [-], of displacements u, (B, N, D)."""
+    return (prediction - batch.displacement).norm(dim=2).amax(dim=1)
+
+
+def signal_to_noise(prediction: Tensor, batch: Sample) -> Tensor:
+    """Return 20 log10(||u|| / ||u - v||), (B,) [dB], of displacements u, (B, N, D)."""
+    return 20 * (_norm(prediction) / _norm(prediction - batch.displacement)).log10()
+
+
+METRICS: dict[str, tuple[int, Callable[[Tensor], Tensor]]] = {  # column of a load, reduction
+    "e_mean": (0, torch.mean),
+    "e_max": (1, torch.max),
+    "SNR_min": (2, torch.min),
+    # The formula in the paper has a factor of 10, its tables have 20.
+    "SNR_min_printed": (2, lambda decibels: decibels.min() / 2),
+    "rel_L2_median": (3, median),
+    "rel_L2_worst": (3, torch.max),
+    "residual": (4, median),  # ||R_free(u)|| / ||f||
+    "min_det_F": (5, torch.min),  # 0 or less means an inverted element
+}
+
+
+class ErrorMetrics(Metric):
+    """The errors `METRICS` of predictions, by name.
+
+    It is updated with (prediction, batch): displacements over L, (B, N, D), and a `Sample`.
 
     Attributes:
-        reduce: From the numbers of all loads (S,) to the metric ().
+        problem: The finite-element problem, on the device of the predictions.
     """
 
     full_state_update = False
-    values: list[Tensor]
-    reduce: Callable[[Tensor], Tensor]
+    values: list[Tensor]  # (B, 6) each
 
-    def __init__(self, **kwargs: Any) -> None:
+    def __init__(self, problem: Problem, **kwargs: Any) -> None:
+        """Take the problem; the other arguments are those of `torchmetrics.Metric`."""
         super().__init__(**kwargs)
+        self.problem = problem
         self.add_state("values", default=[], dist_reduce_fx="cat")
 
     def update(self, prediction: Tensor, batch: Sample) -> None:
-        """Add the numbers of a batch."""
-        self.values.append(self.measure(prediction.double(), batch))
-
-    def compute(self) -> Tensor:
-        """Return the metric over all loads, ()."""
-        return self.reduce(dim_zero_cat(self.values))
-
-    def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        """Return one number per load, (B,)."""
-        raise NotImplementedError
-
-
-class _OfProblem(_PerLoad):
-    """Base class of the metrics that one evaluation of the body gives.
-
-    Each of them stores the relative residual and min det F of each load, (B, 2). A compute group of
-    `MetricCollection` therefore evaluates the body once for all of them.
-
-    Attributes:
-        column: Column of the metric.
-    """
-
-    column: int
-
-    def __init__(self, problem: Problem, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.problem = problem
-
-    def update(self, prediction: Tensor, batch: Sample) -> None:
-        """Add the numbers of a batch."""
-        self.values.append(self._evaluate(prediction.double(), batch))
-
-    def compute(self) -> Tensor:
-        """Return the metric over all loads, ()."""
-        return self.reduce(dim_zero_cat(self.values)[:, self.column])
-
-    def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        return self._evaluate(prediction, batch)[:, self.column]
-
-    def _evaluate(self, prediction: Tensor, batch: Sample) -> Tensor:
-        """Return the relative residual and min det F of each load, (B, 2)."""
-        problem = self.problem.with_parameters(batch.parameters)
-        internal, volume_ratio = problem.evaluate(prediction)
+        """Add the numbers of a batch, computed in double precision."""
+        u, problem = prediction.double(), self.problem.with_parameters(batch.parameters)
+        internal, volume_ratio = problem.evaluate(u)
         residual = problem.relative_residual_of(internal, batch.force)
-        return torch.stack([torch.nan_to_num(residual, nan=torch.inf), volume_ratio], dim=1)
+        columns = (
+            mean_errors(u, batch),
+            largest_errors(u, batch),
+            signal_to_noise(u, batch),
+            relative_errors(u, batch),
+            torch.nan_to_num(residual, nan=torch.inf),
+            volume_ratio,
+        )
+        self.values.append(torch.stack(columns, dim=1))
+
+    def compute(self) -> dict[str, Tensor]:
+        """Return the metrics over all loads by name, () each."""
+        values = dim_zero_cat(self.values)
+        return {name: reduce(values[:, column]) for name, (column, reduce) in METRICS.items()}
 
 
-class MeanError(_PerLoad):
-    """e_mean = 1/(N S) sum_s ||u_s - v_s||, with N degrees of freedom and S loads.
-
-    It decreases like 1/sqrt(N) under refinement and must not be compared across meshes.
-    """
-
-    reduce = staticmethod(torch.mean)
-
-    def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        return _error(prediction, batch) / prediction[0].numel()
-
-
-class MaxError(_PerLoad):
-    """e_max: the largest nodal error ||u - v|| over all nodes and loads, over L."""
-
-    reduce = staticmethod(torch.max)
-
-    def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        return (prediction - batch.displacement).norm(dim=2).amax(dim=1)
-
-
-class MinSNR(_PerLoad):
-    """SNR_min: the minimum of 20 log10(||u|| / ||u - v||) over loads [dB].
-
-    The formula in the paper has a factor of 10, its tables have 20; `printed` selects 10.
-    """
-
-    reduce = staticmethod(torch.min)
-
-    def __init__(self, *, printed: bool = False, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.factor = 10 if printed else 20
-
-    def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        ratio = prediction.flatten(1).norm(dim=1) / _error(prediction, batch)
-        return self.factor * ratio.log10()
-
-
-class RelativeL2(_PerLoad):
-    """||u - v|| / ||v||: median over loads, or maximum if `worst`."""
-
-    def __init__(self, *, worst: bool = False, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.reduce = torch.max if worst else median
-
-    def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        return _error(prediction, batch) / batch.displacement.flatten(1).norm(dim=1)
-
-
-class ResidualRatio(_OfProblem):
-    """Median over loads of the relative residual ||R_free(u)|| / ||f||."""
-
-    reduce = staticmethod(median)
-    column = 0
-
-
-class MinVolumeRatio(_OfProblem):
-    """min det F over quadrature points and loads; 0 or less means an inverted element."""
-
-    reduce = staticmethod(torch.min)
-    column = 1
-
-
-def default_metrics(problem: Problem) -> MetricCollection:
-    """Return all metrics, named as in the tables."""
-    return MetricCollection(
-        {
-            "e_mean": MeanError(),
-            "e_max": MaxError(),
-            "SNR_min": MinSNR(),
-            "SNR_min_printed": MinSNR(printed=True),
-            "rel_L2_median": RelativeL2(),
-            "rel_L2_worst": RelativeL2(worst=True),
-            "residual": ResidualRatio(problem),
-            "min_det_F": MinVolumeRatio(problem),
-        },
-        # in alphabetical order: with another one `forward` loses the numbers of earlier batches
-        compute_groups=[["min_det_F", "residual"]],
-    )
-
-
-def _error(prediction: Tensor, batch: Sample) -> Tensor:
-    """Return the norms of the errors, (B,)."""
-    return (prediction - batch.displacement).flatten(1).norm(dim=1)
+def _norm(field: Tensor) -> Tensor:
+    return field.flatten(1).norm(dim=1)
 
 
 class PerLoadErrors(NamedTuple):

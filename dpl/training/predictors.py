@@ -17,12 +17,13 @@ from dpl.models.inputs import Base, Inputs
 from dpl.models.linear_base import LinearBase, sampled_solutions
 from dpl.models.protocols import HasBases, HasCorrection
 from dpl.models.stored_buffers import StoredBuffers
+from dpl.models.whitening import FieldWhitening
 from dpl.scene import Sample, Scene
-from dpl.training.linear_samples import LinearBatch, LinearSamples, linear_solutions
 
 if TYPE_CHECKING:  # the losses import Lightning, which a loaded run does not need
-    from dpl.training.losses.loss import Loss, LossContext
+    from dpl.training.losses.loss import Loss
 
+CHUNK = 256  # loads whose linear solutions are computed at a time
 MAX_SNAPSHOTS = 4096  # samples and images from which a network computes its bases
 SCALES = ("force_scale", "displacement_scale")
 
@@ -117,10 +118,6 @@ class Predictor(StoredBuffers):
         """Type of the weights."""
         return next((weights.dtype for weights in self.net.parameters()), torch.float32)
 
-    def loss(self, batch: Any, loss: "Loss", physics: "LossContext") -> Tensor:
-        """Return the loss of a batch of `dataset`, ()."""
-        return loss(*self.predict_batch(batch), physics)
-
     def correction(self) -> SubspaceNewton | None:
         """Return Newton's method in the modes of a network that `HasCorrection`, else None."""
         own = hasattr(self.net, "correction")
@@ -200,7 +197,22 @@ class Scaled(Predictor):
 
 
 class OnLinearSolution(Predictor):
-    """A network whose gated output is added to the linear solution, see `LinearBase`."""
+    """A network whose gated output is added to the linear solution.
+
+    With the linear solution v of a load, the displacement scale s, the amplitude a = rms(v) / s and
+    a whitening W of linear solutions (`FieldWhitening`), the network N predicts
+
+        u = v + s a^2 / (1 + a) N(W v / rms(v), a).
+
+    The nonlinear part of a hyperelastic displacement is O(|f|^2) at small loads and grows at most
+    as fast as v at large ones; the gate a^2 / (1 + a) does both. The outputs that are wanted are
+    therefore of order one for all loads, and the prediction of a small load is the linear
+    solution. v determines the load, so that it replaces the force as the input of the network.
+
+    Attributes:
+        base: Function of loads that returns v.
+        whiten: W, a function of fields (B, N, D).
+    """
 
     meaning = (
         "v = linear solution over length, a = rms(v) / scales.displacement; input = whitened "
@@ -220,7 +232,8 @@ class OnLinearSolution(Predictor):
         """
         force, linear = sampled_solutions(scene)
         super().__init__(net, scene, *scales(scene, force, linear))
-        self.base = LinearBase(scene, linear)
+        self.base = LinearBase(scene)
+        self.whiten = FieldWhitening(self.normalise(linear)[0], scene.problem.free)
 
     def forward(self, load: Load, linear: Tensor | None = None) -> Tensor:
         """Return displacements over L, (B, N, D) [-], in the precision of the forces.
@@ -230,18 +243,31 @@ class OnLinearSolution(Predictor):
             linear: Their linear solutions, (B, N, D) [-], if they are known.
         """
         linear = self.base.solve(load) if linear is None else linear.to(load.force.dtype)
-        field, amplitude = self.base.scale_inputs(linear, self.displacement_scale)
+        field, amplitude = self.normalise(linear)
         scalars = self.scalars(load, 2 * amplitude / (1 + amplitude) - 1)
-        output = self.net(self.base.whiten(field.to(self.dtype)), scalars).to(linear.dtype)
-        gate = self.base.gate(amplitude)[:, None, None]
-        nonlinear = gate * (output * self.displacement_scale)
+        output = self.net(self.whiten(field.to(self.dtype)), scalars).to(linear.dtype)
+        nonlinear = self._gate(amplitude) * output
         return linear + torch.where(self.problem.free, nonlinear, 0.0)
 
-    def predict_batch(self, batch: LinearBatch | Sample) -> tuple[Tensor, Sample]:
+    def normalise(self, linear: Tensor) -> tuple[Tensor, Tensor]:
+        """Return v / rms(v), (B, N, D), and amplitudes a, (B,), of linear solutions (B, N, D)."""
+        free = self.scene.problem.free.to(linear.device)  # no index: a GPU waits for its size
+        square = torch.where(free, linear, 0.0).square().sum(dim=(1, 2)) / free.sum()
+        size = torch.where(square > 0, square, 1.0).sqrt()  # the root has no gradient at zero
+        amplitude = torch.where(square > 0, size, 0.0) / self.displacement_scale
+        return linear / size[:, None, None], amplitude
+
+    def _gate(self, amplitude: Tensor) -> Tensor:
+        """Return s a^2 / (1 + a), (B, 1, 1)."""
+        gate = amplitude * (amplitude / (1 + amplitude))
+        return (self.displacement_scale * gate)[:, None, None]
+
+    def predict_batch(self, batch: tuple[Tensor, Sample] | Sample) -> tuple[Tensor, Sample]:
         """Return the displacements of a batch; batches of a stream have no linear solutions."""
-        if isinstance(batch, LinearBatch):
-            return self(batch.sample.load, batch.linear), batch.sample
-        return self(batch.load), batch
+        if isinstance(batch, Sample):
+            return self(batch.load), batch
+        linear, sample = batch
+        return self(sample.load, linear), sample
 
     def dataset(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
         """Return samples with their linear solutions, which are computed once."""
@@ -249,10 +275,11 @@ class OnLinearSolution(Predictor):
 
     def examples(self, samples: Sample) -> tuple[Tensor, Tensor]:
         """Return whitened linear solutions and scaled nonlinear displacements."""
-        linear, scale = linear_solutions(samples.load, self.base).double(), self.displacement_scale
-        field, amplitude = self.base.scale_inputs(linear, scale)
+        linear = linear_solutions(samples.load, self.base).double()
+        field, amplitude = self.normalise(linear)
         missed = torch.where(self.problem.free, samples.displacement - linear, 0.0)
-        return self.base.whiten(field), self.base.scale_outputs(missed, amplitude, scale)
+        gate = self._gate(amplitude)
+        return self.whiten(field), missed / torch.where(gate > 0, gate, 1.0)
 
     def skipped_work(self, loss: "Loss") -> list[str]:
         """Return the work that network, base and loss save, one line each."""
@@ -277,6 +304,29 @@ class Fitted(Predictor):
     def skipped_work(self, loss: "Loss") -> list[str]:
         """Return the work that the model saves, one line each; the loss is not used."""
         return list(getattr(self.net, "skipped_work", list)())
+
+
+class LinearSamples(Samples):
+    """Samples in memory with their linear solutions, and images of both under symmetries."""
+
+    def __init__(self, samples: Sample, base: LinearBase, group: SymmetryGroup) -> None:
+        """Compute the linear solutions of the samples, (S, N, D) [-], float32."""
+        super().__init__(samples, group)
+        self.linear = linear_solutions(samples.load, base)
+
+    def __getitems__(self, indices: list[int]) -> tuple[Tensor, Sample]:  # type: ignore[override]
+        """Return the linear solutions and the samples of a batch."""
+        count = len(self.linear)
+        linear = self.linear[[i % count for i in indices]]
+        if self.group:
+            linear = self.group.images(linear, torch.tensor([i // count for i in indices]))
+        return linear, super().__getitems__(indices)
+
+
+def linear_solutions(load: Load, base: LinearBase) -> Tensor:
+    """Return the linear solutions of many loads, (S, N, D) [-], float32, solved in chunks."""
+    parts = zip(*(column.split(CHUNK) for column in load), strict=True)
+    return torch.cat([base.solve(Load(*part)).float() for part in parts])
 
 
 def predictor_of(

@@ -18,9 +18,6 @@ def warmup_cosine(
         optimizer: The optimiser; its learning rate is the maximum of the schedule.
         total_steps: Number of steps after which the learning rate is zero.
         warmup: Fraction of the steps in which the learning rate rises.
-
-    Raises:
-        ValueError: `warmup` lies outside [0, 1).
     """
     if not 0 <= warmup < 1:
         raise ValueError(f"warmup = {warmup} must be 0 or more and less than 1")

@@ -14,8 +14,7 @@ from dpl.scene import Sample, Scene
 from dpl.training import checkpoints
 from dpl.training.callbacks.averaged_weights import AveragedWeights
 from dpl.training.losses.loss import Loss, LossContext
-from dpl.training.metrics import default_metrics
-from dpl.training.random_states import random_states, set_random_states
+from dpl.training.metrics import ErrorMetrics
 from dpl.training.schedules import step_in_time, time_fraction, total_steps
 from dpl.training.trained import TrainedSurrogate
 
@@ -68,8 +67,7 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
         self.physics = LossContext(scene.problem, self.largest_force)
-        self.val_metrics = default_metrics(scene.problem).clone(prefix="val/")
-        self.test_metrics = default_metrics(scene.problem).clone(prefix="test/")
+        self.metrics = ErrorMetrics(scene.problem)
 
     @classmethod
     def from_network(
@@ -103,22 +101,33 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
 
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
         """Return the loss of a batch, ()."""
-        loss = self.predictor.loss(batch, self.loss, self.physics)
+        loss = self.loss(*self.predictor.predict_batch(batch), self.physics)
         self.log("loss/train", loss, prog_bar=True, batch_size=len(batch[0]))
         return loss
 
     def validation_step(self, batch: Sample, batch_idx: int) -> None:
-        """Update the validation metrics."""
+        """Log the loss and update the metrics."""
         prediction = self.predict(batch.load)
         loss = self.loss(prediction, batch, self.physics)
         self.log("loss/val", loss, batch_size=len(batch.force))
-        self.val_metrics.update(prediction, batch)
-        self.log_dict(self.val_metrics, batch_size=len(batch.force))
+        self.metrics.update(prediction, batch)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics as `val/NAME`."""
+        self._log_metrics("val")
 
     def test_step(self, batch: Sample, batch_idx: int) -> None:
         """Update the test metrics."""
-        self.test_metrics.update(self.predict(batch.load), batch)
-        self.log_dict(self.test_metrics, batch_size=len(batch.force))
+        self.metrics.update(self.predict(batch.load), batch)
+
+    def on_test_epoch_end(self) -> None:
+        """Log the metrics as `test/NAME`."""
+        self._log_metrics("test")
+
+    def _log_metrics(self, part: str) -> None:
+        numbers = self.metrics.compute()  # those of all processes
+        self.metrics.reset()
+        self.log_dict({f"{part}/{name}": value for name, value in numbers.items()}, sync_dist=True)
 
     def setup(self, stage: str) -> None:
         """Fit the bases of the network."""
@@ -136,12 +145,8 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         All ways to move a module end here. Lightning moves it after the hook `setup`.
         """
         super()._apply(fn, recurse)
-        problem = self.predictor.problem
-        self.physics = LossContext(problem, self.largest_force)
-        for collection in (self.val_metrics, self.test_metrics):
-            for metric in collection.values():
-                if hasattr(metric, "problem"):
-                    metric.problem = problem
+        self.metrics.problem = self.predictor.problem
+        self.physics = LossContext(self.predictor.problem, self.largest_force)
         return self
 
     def configure_callbacks(self) -> list[L.Callback]:
@@ -158,11 +163,7 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
             trainer.check_val_every_n_epoch = 1
 
     def configure_optimizers(self) -> Any:
-        """Return the optimiser with its schedule.
-
-        Raises:
-            TypeError: The network is fitted in closed form.
-        """
+        """Return the optimiser with its schedule."""
         if self.predictor.is_closed_form:
             name = type(self.net).__name__
             raise TypeError(f"{name} has no gradient descent; call dpl.training.fit")
@@ -183,22 +184,20 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the scene, the states of random number generators and averaged weights."""
-        checkpoint |= checkpoints.entries_of_scene(self.scene) | {"random": random_states()}
+        checkpoint |= checkpoints.entries_of_scene(self.scene) | {
+            "random": checkpoints.random_states()
+        }
         # not a hook of the callback: Lightning calls those only for complete checkpoints
         for callback in self._trainer.callbacks if self._trainer else ():
             if isinstance(callback, AveragedWeights):
                 callback.replace_weights(checkpoint)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Check that the checkpoint belongs to this scene.
-
-        Raises:
-            ValueError: The checkpoint belongs to another scene.
-        """
+        """Raise ValueError if the checkpoint belongs to another scene."""
         checkpoints.check_scene(checkpoint, self.scene)
         self._random_states = checkpoint.get("random")
 
     def on_train_start(self) -> None:
         """Restore the states of random number generators of a resumed run."""
         if self._random_states is not None:
-            set_random_states(self._random_states)
+            checkpoints.set_random_states(self._random_states)

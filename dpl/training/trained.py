@@ -62,8 +62,6 @@ class TrainedSurrogate(nn.Module):
             RuntimeError: The weights are of another network.
         """
         own = self.state_dict()
-        if "force_scale" in state_dict:
-            raise ValueError("was written by an earlier version of dpl; train the run again")
         for name, stored in state_dict.items():
             dtype = own[name].dtype if name in own else stored.dtype
             if stored.dtype != dtype and not stored.is_floating_point() & dtype.is_floating_point:

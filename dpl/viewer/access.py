@@ -17,10 +17,10 @@ import re
 import secrets
 import socket
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from http.client import HTTPConnection
 from typing import Any
 
 import websockets.asyncio.server
@@ -65,25 +65,23 @@ class RateLimitedHandler(logging.Handler):
         self.logger = logging.Logger("dpl.viewer", logging.ERROR)
         self.logger.addHandler(self)
         self._clock = clock
-        self._count_lock = threading.Lock()
         self._last_line = -math.inf
         self._n_omitted = 0
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print or count a record."""
-        self.report(record.getMessage(), record.exc_info[1] if record.exc_info else None)
+        """Print a record and its exception in one line, or count it if the last is too recent.
 
-    def report(self, message: str, error: BaseException | None = None) -> None:
-        """Print a failure and its exception in one line, or count it if the last is too recent."""
-        with self._count_lock:
-            now = self._clock()
-            if now - self._last_line < MIN_INTERVAL:
-                self._n_omitted += 1
-                return
-            omitted = f" ({self._n_omitted} more were not printed)" if self._n_omitted else ""
-            self._last_line, self._n_omitted = now, 0
+        `logging.Handler.handle` calls this method under a lock.
+        """
+        now = self._clock()
+        if now - self._last_line < MIN_INTERVAL:
+            self._n_omitted += 1
+            return
+        omitted = f" ({self._n_omitted} more were not printed)" if self._n_omitted else ""
+        self._last_line, self._n_omitted = now, 0
+        error = record.exc_info[1] if record.exc_info else None
         cause = "" if error is None else f": {type(error).__name__}: {error}"
-        line = "".join(c if c.isprintable() else " " for c in f"{message}{cause}")
+        line = "".join(c if c.isprintable() else " " for c in f"{record.getMessage()}{cause}")
         line = " ".join(line.split())[:MAX_CHARACTERS].encode("ascii", "backslashreplace").decode()
         print(f"warning: browser request failed: {line}{omitted}", file=sys.stderr, flush=True)
 
@@ -103,7 +101,7 @@ class RateLimitedHandler(logging.Handler):
         try:
             yield
         except Exception as error:  # no request of a browser may stop the server
-            self.report("control", error)
+            self.logger.error("control", exc_info=error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +227,9 @@ def serve_with(policy: AccessPolicy) -> Iterator[None]:
     ) -> Any:
         options |= {"max_size": MAX_MESSAGE, "server_header": None, "logger": policy.log.logger}
         asyncio.get_running_loop().set_exception_handler(
-            lambda loop, context: policy.log.report(context["message"], context.get("exception"))
+            lambda loop, context: policy.log.logger.error(
+                context["message"], exc_info=context.get("exception")
+            )
         )
         authenticated = policy.authenticate(process_request)
         return original(handler, sock=policy.socket, process_request=authenticated, **options)
@@ -241,22 +241,16 @@ def serve_with(policy: AccessPolicy) -> Iterator[None]:
         websockets.asyncio.server.serve = original
 
 
-def request_status(policy: AccessPolicy, path: str, **headers: str) -> int:
+def request_status(policy: AccessPolicy, path: str, headers: Mapping[str, str]) -> int:
     """Return the HTTP status of a request to the socket of a policy, sent from this machine."""
-    lines = [f"GET {path} HTTP/1.1"]
-    lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(policy.host, policy.host)
-    with socket.create_connection((host, policy.port), timeout=60) as connection:
-        connection.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
-        return int(connection.recv(64).split()[1])
+    with contextlib.closing(HTTPConnection(host, policy.port, timeout=60)) as connection:
+        connection.request("GET", path, headers=dict(headers))
+        return connection.getresponse().status
 
 
 def check_server(policy: AccessPolicy) -> None:
-    """Send requests that must be allowed and requests that must be denied.
-
-    Raises:
-        RuntimeError: A response has another status than the policy requires.
-    """
+    """Raise RuntimeError if the server allows or denies a request against the policy."""
     path, own = f"/{policy.token}/", {"Host": f"127.0.0.1:{policy.port}"}
     upgrade = {"Connection": "Upgrade", "Upgrade": "websocket"}
     cases = [
@@ -267,7 +261,7 @@ def check_server(policy: AccessPolicy) -> None:
         (403, path, {**own, **upgrade}),
     ]
     for status, path, headers in cases:
-        if (found := request_status(policy, path, **headers)) != status:
+        if (found := request_status(policy, path, headers)) != status:
             raise RuntimeError(
                 f"access control: a request returned status {found} instead of {status}; "
                 "the page is not served"

@@ -1,4 +1,8 @@
-"""Modes of a drag: the hand pulls the body by a load on a patch, or grasps the patch."""
+"""Modes of a drag: the hand pulls the body by a load on a patch, or grasps the patch.
+
+A hand `take`s a node of the shown body, `move`s it with the mouse, and `hold`s the patch as the
+sliders say; the two latter return requests, which the worker makes.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -12,44 +16,30 @@ from dpl.viewer.frames import Body, Frame
 from dpl.viewer.requests import MakeRequest, Patch
 
 
-class Hand:
-    """A mode of a drag, which converts drags and sliders to requests."""
+class _Hand:
+    """The body, the controls of the patch and the displacement at the begin of a drag over L."""
 
     def __init__(self, body: Body, controls: Controls) -> None:
-        """Store the body and the controls of the patch."""
         self._body, self._controls = body, controls
-        self._start = torch.zeros(body.scene.problem.shape[1]).double()  # at the begin of a drag
+        self._start = torch.zeros(body.scene.problem.shape[1]).double()
 
-    def take(self, node: int, frame: Frame) -> int:
-        """Begin a drag at a node of the shown body; return the node at the centre of the patch."""
-        raise NotImplementedError
-
-    def move(self, motion: Tensor) -> MakeRequest:
-        """Return the request after a motion of the mouse over L, (D,) [-], since `take`."""
-        raise NotImplementedError
-
-    def hold(self, node: int, frame: Frame | None) -> MakeRequest:
-        """Return the request of the sliders for the patch of a node of the shown body."""
-        raise NotImplementedError
-
-    def release(self) -> None:
-        """Forget the patch, because another load replaces the request."""
-
-    def marked_nodes(self, node: int) -> Tensor:
-        """Mask of the nodes of the patch of a node, (N,)."""
-        raise NotImplementedError
+    def _patch(self, node: int) -> Patch:
+        return self._body.patch(node, self._controls.radius.value)
 
 
-class PullingHand(Hand):
+class PullingHand(_Hand):
     """Converts drags and sliders to modal loads on a patch."""
 
     def take(self, node: int, frame: Frame) -> int:
-        """Move the patch to the node."""
+        """Begin a drag at a node of the shown body; return the node at the centre of the patch."""
         self._node, self._start = node, frame.displacement[node] / self._body.scene.length
         return node
 
     def move(self, motion: Tensor) -> MakeRequest:
-        """Return the load whose linear response moves the dragged point to the mouse."""
+        """Return the load whose linear response moves the dragged point to the mouse.
+
+        `motion` is that of the mouse over L since `take`, (D,) [-].
+        """
         target, controls = self._start + motion, self._controls
         size = float(target.norm())
         if size > 0:
@@ -69,15 +59,12 @@ class PullingHand(Hand):
         """Mask of the loaded nodes, (N,)."""
         return self._patch(node).node_mask
 
-    def _patch(self, node: int) -> Patch:
-        return self._body.patch(node, self._controls.radius.value)
-
     def _request(self, make_force: Callable[[], Tensor]) -> MakeRequest:
-        """Return the request of a dimensionless force (N, D), which the worker makes."""
+        """Return the request of a dimensionless force (N, D)."""
         return lambda: self._body.request(make_force())
 
 
-class GraspingHand(Hand):
+class GraspingHand(_Hand):
     """Converts drags and sliders to rigid motions of a patch, which it holds until `release`."""
 
     def __init__(self, body: Body, controls: Controls) -> None:
@@ -105,7 +92,7 @@ class GraspingHand(Hand):
         return self._request()
 
     def release(self) -> None:
-        """Forget the patch."""
+        """Forget the patch, because another load replaces the request."""
         self._node = None
 
     def marked_nodes(self, node: int) -> Tensor:
@@ -120,9 +107,6 @@ class GraspingHand(Hand):
         if frame is not None and held.any():
             self._translation = frame.displacement[held].mean(dim=0) / self._body.scene.length
         self._node, self._controls.angle.value = node, 0.0
-
-    def _patch(self, node: int) -> Patch:
-        return self._body.patch(node, self._controls.radius.value)
 
     def _request(self) -> MakeRequest:
         """Return the request of the held patch with the rotation of the controls."""

@@ -14,9 +14,9 @@ import viser
 
 from dpl.viewer.access import AccessPolicy, check_server, serve_with
 from dpl.viewer.camera import UP, Placement
-from dpl.viewer.controls import BAD, GOOD, GRASP, PULL, WARNING, Controls, problem_of
+from dpl.viewer.controls import BAD, GOOD, GRASP, WARNING, Controls, problem_of
 from dpl.viewer.frames import Body, Frame
-from dpl.viewer.hands import GraspingHand, Hand, PullingHand
+from dpl.viewer.hands import GraspingHand, PullingHand
 from dpl.viewer.nodes import BodyNode, LoadMarker, LocalServer, add_environment
 from dpl.viewer.recording import SUFFIXES, Recording, farthest_node, rotating_load
 from dpl.viewer.renderer import ColourScale
@@ -69,10 +69,8 @@ class Page:
             self.close()
             raise
         self.controls = Controls(self.server, body, title, folder)
-        self._hands: dict[str, Hand] = {
-            PULL: PullingHand(body, self.controls),
-            GRASP: GraspingHand(body, self.controls),
-        }
+        self._pulling = PullingHand(body, self.controls)
+        self._grasping = GraspingHand(body, self.controls)
         self.placement = Placement.of(body, self.node, self.controls.radius.value)
         self._build_scene()
         self._connect()
@@ -86,9 +84,9 @@ class Page:
         return self._policy.url
 
     @property
-    def hand(self) -> Hand:
+    def hand(self) -> PullingHand | GraspingHand:
         """The selected mode of a drag."""
-        return self._hands[self.controls.mode.value]
+        return self._grasping if self.controls.mode.value == GRASP else self._pulling
 
     def close(self) -> None:
         """Stop worker and server."""
@@ -163,15 +161,11 @@ class Page:
     def apply_mode(self, event: Any = None) -> None:
         """Show the controls of the selected mode; the load or the grasp remains."""
         self._grabbed = self._rotating = None
-        self._release()
+        self._grasping.release()
         self.controls.show_mode()
         self._mark_patch()
         if self.frame is not None:
             self._marker.show(self.frame)
-
-    def _release(self) -> None:
-        for hand in self._hands.values():
-            hand.release()
 
     def _apply_moduli(self, event: Any) -> None:
         if event.client is not None:
@@ -185,7 +179,7 @@ class Page:
         for name, value in request.parameters.items():
             self.controls.parameters[name].value = value
         self.controls.follows_frame = True
-        self._release()
+        self._grasping.release()
         self._submit(lambda: request)
         self._marker.mask = request.force.any(dim=1).numpy()[self.body.surface.nodes]
         self.node = self.body.surface.middle_node(self._marker.mask)
@@ -193,7 +187,7 @@ class Page:
     def reset(self, event: Any) -> None:
         """Remove the load and restore the default Young's modulus."""
         self.controls.follows_frame = False
-        self._release()
+        self._grasping.release()
         self.controls.amplitude.value = self.controls.angle.value = 0.0
         self.controls.modulus = self.body.young
         self._submit(self.body.zero_load)

@@ -1,21 +1,7 @@
 """Colours and matplotlib parameters of all figures."""
 
-import itertools
-from collections.abc import Iterable
-
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 DPI = 200  # resolution of figures [dots per inch]
-METHOD_COLOURS = {  # a method has the same colour in all figures
-    "Newton": "0.1",
-    "linear": "0.5",
-    "unrolled": COLOURS[0],
-    "fcnn": COLOURS[1],
-    "pod": COLOURS[2],
-    "cnn": COLOURS[3],
-    "gnn": COLOURS[4],
-    "POD-Galerkin": COLOURS[5],
-}
-OTHER_COLOURS = ("#7F3C8D", "#A5AA99", "#80BA5A", "#E73F74")  # of methods without an own colour
 
 STYLE = {
     "font.size": 8.5,
@@ -32,9 +18,3 @@ STYLE = {
     "xtick.major.width": 0.7,
     "ytick.major.width": 0.7,
 }
-
-
-def method_colours(names: Iterable[str]) -> dict[str, str]:
-    """Return the colours of methods by name: those of `METHOD_COLOURS`, else further ones."""
-    others = itertools.cycle(OTHER_COLOURS)
-    return {name: METHOD_COLOURS.get(name) or next(others) for name in names}

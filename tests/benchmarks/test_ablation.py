@@ -6,7 +6,7 @@ import torch
 from benchmarks import ablation
 from benchmarks.samples import solved
 from dpl.models import Unrolled
-from dpl.training.metrics import default_metrics
+from dpl.training import ErrorMetrics
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_errors_are_those_of_the_predictions_and_of_a_newton_step(build, sets, m
         (predicted, row.e_mean, row.rel_L2_worst),
         (corrected, row.e_mean_corrected, row.rel_L2_worst_corrected),
     ):
-        metrics = default_metrics(net.scene.problem)
+        metrics = ErrorMetrics(net.scene.problem)
         metrics.update(field, test)
         known = metrics.compute()
         assert e_mean == pytest.approx(float(known["e_mean"]), rel=1e-6)

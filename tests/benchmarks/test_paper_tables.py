@@ -12,8 +12,7 @@ from benchmarks.tables import read
 from dpl.evaluation.tables import write
 from dpl.fem import solve
 from dpl.models import PODNet
-from dpl.training import MSE, Surrogate
-from dpl.training.metrics import default_metrics
+from dpl.training import MSE, ErrorMetrics, Surrogate
 
 SMALL = {"width": 16, "blocks": 1}
 
@@ -82,7 +81,7 @@ def test_every_method_is_measured_on_every_set(rows, sets):
 def test_errors_are_those_of_the_metrics(scene, rows, sets):
     for name, sample in sets.items():
         answer = torch.stack([scene.linear.solve(f) for f in sample.force])
-        expected = default_metrics(scene.problem)
+        expected = ErrorMetrics(scene.problem)
         expected.update(answer, sample)
         row, errors = rows["linear", name]
         for key in ("e_mean", "e_max", "SNR_min", "rel_L2_worst", "residual", "min_det_F"):

@@ -7,7 +7,7 @@ from PIL import Image
 from benchmarks import single_loads
 from benchmarks.paper_tables import PAPER
 from dpl import Sample
-from dpl.training.metrics import default_metrics
+from dpl.training import ErrorMetrics
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_an_error_of_one_percent_has_40_db(scene, batch, chosen):
     assert row.e_max == pytest.approx(0.01 * row.deflection)
     assert pytest.approx(40.0864, abs=1e-3) == row.SNR
     assert torch.equal(found["near"], 1.01 * exact[None])
-    metrics = default_metrics(scene.problem)
+    metrics = ErrorMetrics(scene.problem)
     metrics.update(found["near"], Sample(*(column[chosen : chosen + 1] for column in batch)))
     expected = {name: float(value) for name, value in metrics.compute().items()}
     assert row.e_mean == pytest.approx(expected["e_mean"])

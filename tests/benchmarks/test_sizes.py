@@ -5,8 +5,8 @@ import csv
 import pytest
 
 from benchmarks import sizes as beams
+from benchmarks.study import METHOD_COLOURS
 from dpl.evaluation.tables import write
-from dpl.visualization import METHOD_COLOURS
 
 
 @pytest.mark.slow

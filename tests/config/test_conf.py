@@ -283,7 +283,7 @@ def test_the_command_line_wins_over_an_experiment(compose):
 @pytest.mark.parametrize("name", options("model"))
 def test_every_model_has_the_linear_solution_unless_the_paper_is_asked_for(compose, name):
     cfg = compose(f"model={name}", "folder=.", command="train")
-    assert cfg.model.get("base") == ("linear" if name != "unrolled" else None)
+    assert cfg.model.get("base") == ("linear" if name not in ("unrolled", "fcnn_paper") else None)
     assert cfg.optimizer._target_.endswith("Muon")
     cfg = compose(f"model={name}", "experiment=paper", "folder=.", command="train")
     assert cfg.model.base is None

@@ -1,5 +1,6 @@
 """ONNX graphs of all networks against torch, exported folders, and the example consumers."""
 
+import json
 import os
 import subprocess
 import sys
@@ -20,16 +21,14 @@ from dpl.export import (
     export_onnx,
     read_metadata,
     read_reference,
-    verify_folder,
     write_folder,
 )
 from dpl.export.comparison import relative_differences, sample_check_loads
 from dpl.export.folder import read_raw
 from dpl.export.metadata import describe, solve_reference
 from dpl.export.onnx_graph import missing_packages
-from dpl.fem.postprocess import triangles
 from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
-from dpl.training import MSE, Surrogate
+from dpl.training import MSE, Surrogate, checkpoints
 
 pytestmark = pytest.mark.skipif(
     bool(missing_packages()), reason=f"{', '.join(missing_packages())} not installed (extra onnx)"
@@ -54,6 +53,10 @@ def make_surrogate(make, scene, seed=0, **options):
         truth = fem.solve(scene.solver, load).displacement
         samples = Sample(load.force, truth, load.young, load.parameters)
         surrogate.net.fit(samples, samples)
+        state = surrogate.state_dict()
+        # as from a checkpoint: it has predicted nothing yet, so that the blocks of K(0) are missing
+        surrogate = Surrogate.from_network(network, MSE(), scene, base=None)
+        surrogate.load_state_dict(state)
     return surrogate.eval()
 
 
@@ -103,7 +106,7 @@ NETWORKS = {
 
 
 RARE = {"fcnn, young", "fcnn, poisson", "cnn, immersed", "gnn, edges", "gnn, poisson", "pod"}
-RARE |= {"unrolled, three terms"}
+RARE |= {"unrolled, three terms", "unrolled, poisson", "unrolled, quadratic, no symmetry"}
 EVERY = [pytest.param(one, marks=pytest.mark.slow) if one in RARE else one for one in NETWORKS]
 
 
@@ -137,13 +140,22 @@ def test_onnx_and_torch_agree_for_all_kinds_of_loads_and_batch_sizes(make_graph,
     # random weights with slopes near 1 amplify the rounding errors of whitening about threefold
     limit = 3e-5 if name == "fcnn, linear base" else 1e-5
     assert max(row.max_error for row in rows) < limit
+    if name == "fcnn":  # another weight is detected
+        first = graph.surrogate.net.stages[0].weight
+        with torch.no_grad():
+            first.mul_(1 + 1e-3)
+            rows = compare_outputs(
+                graph, OnnxSession(path), sample_check_loads(graph.surrogate.scene, 4)
+            )
+            first.div_(1 + 1e-3)
+        assert max(row.max_error for row in rows) > limit
 
 
 @pytest.mark.parametrize(
     "name",
     [
         "unrolled",
-        "unrolled, poisson",
+        pytest.param("unrolled, poisson", marks=pytest.mark.slow),
         pytest.param("unrolled, three terms", marks=pytest.mark.slow),
         "fcnn, linear base",
     ],
@@ -160,38 +172,6 @@ def test_a_small_force_on_a_node_has_its_linear_solution(make_graph, name):
     linear = scene.length * next(iter(scene.linear.iterate(load))).displacement
     found = OnnxSession(path)(**inputs)
     assert relative_differences(found, linear.numpy()).max() < 1e-4
-
-
-def test_a_surrogate_from_a_checkpoint_becomes_a_graph(make_graph, tmp_path):
-    """It has predicted nothing yet, so that the blocks of K(0) are missing."""
-    graph, _ = make_graph("unrolled")
-    before, scene = graph.surrogate, graph.surrogate.scene
-    loaded = Surrogate(Unrolled(scene, rank=12, cells=8, stages=1), MSE(), scene)
-    loaded.load_state_dict(before.state_dict())
-    export_onnx(ExportGraph(loaded), tmp_path / "model.onnx")
-    inputs = sample_check_loads(scene, 2).inputs
-    with torch.no_grad():
-        expected = before(**inputs).numpy()
-    found = OnnxSession(tmp_path / "model.onnx")(**inputs)
-    assert relative_differences(found, expected).max() < 1e-5
-
-
-def test_no_load_is_marked(make_graph):
-    for name in ("fcnn", "unrolled", "unrolled, poisson"):
-        assert OnnxSession(make_graph(name)[1]).outputs == ["displacement"]
-
-
-def test_a_graph_with_other_weights_is_detected(make_graph):
-    graph, path = make_graph("fcnn")
-    session, scene = OnnxSession(path), graph.surrogate.scene
-    first = graph.surrogate.net.stages[0].weight
-    with torch.no_grad():
-        first.mul_(1 + 1e-3)
-        rows = compare_outputs(graph, session, sample_check_loads(scene, 4))
-        first.div_(1 + 1e-3)
-    assert max(row.max_error for row in rows) > 1e-5
-    rows = compare_outputs(graph, session, sample_check_loads(scene, 4))
-    assert max(row.max_error for row in rows) < 1e-5
 
 
 class ValueDependent(nn.Module):
@@ -244,37 +224,27 @@ def write_export(make_graph):
     return write_export
 
 
-@pytest.mark.parametrize("name", ["fcnn", "unrolled, quadratic, no symmetry", "cnn, poisson, 2D"])
+@pytest.mark.parametrize("name", ["fcnn", "unrolled", "cnn, poisson, 2D"])
 def test_a_folder_read_back_is_what_was_written(write_export, name):
     graph, folder, reference, meta = write_export(name)
-    verify_folder(folder, graph.surrogate, reference, meta)
+    found, stored = read_metadata(folder), read_reference(folder)
+    assert found == json.loads(json.dumps(meta))
+    assert stored.keys() == reference.keys()
+    assert all(np.array_equal(stored[key], reference[key]) for key in reference)
+    state = checkpoints.read(folder / "weights.safetensors")["state_dict"]
+    own = graph.surrogate.state_dict()
+    assert state.keys() == own.keys()
+    assert all(torch.equal(state[key], own[key]) for key in own)
     problem = graph.surrogate.scene.problem
-    found = read_metadata(folder)
     points = np.array(found["mesh"]["points"])
     assert np.array_equal(points, (problem.length * problem.points).numpy())
     assert len(found["mesh"]["cells"]) == len(problem.cells)
     held = np.zeros(problem.free.numel(), dtype=bool)
     held[found["dofs"]["fixed"]] = True
     assert np.array_equal(held.reshape(problem.shape), ~problem.free.numpy())
-    assert [one["name"] for one in found["model"]["inputs"]] == OnnxSession(
-        folder / "model.onnx"
-    ).inputs
-
-
-@pytest.mark.parametrize(
-    ("file", "change"),
-    [
-        ("meta.json", lambda path: path.write_text(path.read_text().replace("node-major", "x"))),
-        ("reference/force.f64", lambda path: path.write_bytes(bytes(path.stat().st_size))),
-        ("weights.safetensors", lambda path: path.write_bytes(path.read_bytes()[:-1] + b"\x7f")),
-    ],
-)
-def test_a_changed_file_is_detected(write_export, file, change):
-    graph, folder, reference, meta = write_export("fcnn")
-    change(folder / file)
-    with pytest.raises(ValueError, match=r"differs from what was written"):
-        verify_folder(folder, graph.surrogate, reference, meta)
-    write_export("fcnn")
+    session, model = OnnxSession(folder / "model.onnx"), found["model"]
+    assert [one["name"] for one in model["inputs"]] == session.inputs
+    assert [one["name"] for one in model["outputs"]] == session.outputs == ["displacement"]
 
 
 def test_the_reference_has_the_displacements_of_surrogate_and_finite_elements(write_export):
@@ -331,21 +301,6 @@ def test_the_training_range_can_be_checked_without_this_package(write_export):
         if k < 6:
             assert abs(q).max() == pytest.approx(float(amplitude[k]), rel=1e-6)
             assert np.linalg.norm(force) <= meta["range"]["largest_force"]
-
-
-@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
-def test_triangles_enclose_the_body_and_have_outward_normals(make_scene, cell):
-    flat = cell in ("quad", "triangle")
-    body = {"mesh": fem.rectangle([100.0, 25.0], [5, 3], cell)} if flat else {"cell": cell}
-    problem = make_scene(**body).problem
-    corners = problem.points.numpy()[triangles(fem.surface(problem.mesh))]
-    edges = corners[:, 1:] - corners[:, :1]
-    if flat:
-        assert np.linalg.det(edges).sum() / 2 == pytest.approx(0.25)
-        assert (np.linalg.det(edges) > 0).all()
-    else:
-        volume = np.linalg.det(corners).sum() / 6
-        assert volume == pytest.approx(0.0625)
 
 
 # ---------------------------------------------------------------------- consumers

@@ -157,19 +157,6 @@ def test_lower_precision_of_products_does_not_reach_the_bases(scene, batch, base
     assert (rounded - expected).norm() < 5e-3 * expected.norm()
 
 
-def test_gradients_with_respect_to_forces_equal_finite_differences(scene, batch):
-    net = prepared(scene, batch, rank=40).double().net
-    force, way, weight = (noise(scene, seed=seed).double() for seed in range(3))
-    force.requires_grad_()
-    (slope,) = torch.autograd.grad((weight * answer(net, force)).sum(), force)
-    step = 1e-5
-    with torch.no_grad():
-        ends = [float((weight * answer(net, force + s * step * way)).sum()) for s in (1, -1)]
-    found = float((slope * way).sum())
-    assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(found, rel=1e-6)
-    assert found != 0
-
-
 def test_a_body_fixed_in_some_directions_only_is_accepted():
     """Nodes on rails are fixed in some directions only."""
     ends = [(0, [0.0, None, None]), (1, [None, 0.0, None]), (2, [None, None, 0.0])]
@@ -192,10 +179,3 @@ def test_sizes_are_limited_by_the_degrees_of_freedom_and_need_not_be_equal(scene
     assert PODNet(scene, rank=7, coordinates=60, **SMALL).enter.in_features == 60
     line = f"20 coordinates learnt instead of {int(scene.problem.free.sum())} displacements"
     assert PODNet(scene, rank=20, **SMALL).skipped_work() == [line]
-
-
-@pytest.mark.parametrize(("width", "blocks"), [(16, 0), (24, 2)])
-def test_width_and_blocks_determine_the_number_of_parameters(scene, width, blocks):
-    net = PODNet(scene, rank=10, coordinates=20, width=width, blocks=blocks)
-    expected = (20 * width + width) + blocks * 2 * (width * width + width) + (10 * width + 10)
-    assert sum(weights.numel() for weights in net.parameters()) == expected

@@ -71,8 +71,8 @@ def test_a_network_with_a_base_reads_whitened_linear_solutions(scene, batch):
 
     surrogate = Surrogate(Spy(), MSE(), scene, base="linear")
     surrogate.predict(batch.load)
-    base, scale = surrogate.predictor.base, surrogate.predictor.displacement_scale
-    field, _ = base.scale_inputs(base.solve(batch.load), scale)
-    random, _ = base.scale_inputs(sampled_solutions(scene)[1], scale)
+    predictor = surrogate.predictor
+    field, _ = predictor.normalise(predictor.base.solve(batch.load))
+    random, _ = predictor.normalise(sampled_solutions(scene)[1])
     own = FieldWhitening(random, scene.problem.free)
     assert torch.allclose(surrogate.net.seen, own(field.float()), atol=1e-4)

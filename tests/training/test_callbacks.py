@@ -32,6 +32,7 @@ from dpl.models import FCNN
 from dpl.training import (
     MSE,
     Diverged,
+    ErrorMetrics,
     LogHyperparameters,
     LogLearningRate,
     Surrogate,
@@ -40,7 +41,7 @@ from dpl.training import (
 )
 from dpl.training.callbacks.throughput import resident_memory
 from dpl.training.callbacks.worst_cases import per_sample_errors, side_by_side_mesh
-from dpl.training.metrics import PerLoadErrors, default_metrics, median
+from dpl.training.metrics import median
 
 BATCHES = 3  # an epoch of the tiny data set
 
@@ -129,26 +130,11 @@ def test_the_number_of_validations_between_pictures_doubles_and_the_end_is_drawn
         assert len(written) < 400_000
 
 
-def test_a_single_load_is_drawn_once_and_meshes_can_be_left_out(scene, data, tmp_path):
-    data.sizes["val"] = 1
-    callback = WorstCasePlots(every=2, meshes=False)
-    trainer(tmp_path, callback, epochs=2).fit(surrogate(scene), datamodule=data)
-    found = events(tmp_path)
-    assert steps(found.Images("validation/shapes")) == [2 * BATCHES - 1]
-    assert not found.Tags()["tensors"]
-
-
-@pytest.mark.parametrize("option", ["every", "loads", "max_polygons"])
-def test_options_below_one_raise_an_error(option):
-    with pytest.raises(ValueError, match=f"{option} = 0 must be 1 or more"):
-        WorstCasePlots(**{option: 0})
-
-
 def test_per_sample_errors_equal_the_metrics(scene, batch):
     module = surrogate(scene).eval()
     with torch.no_grad():
         prediction = module.predict(batch.load)
-    judged, collection = per_sample_errors(module, batch, 5), default_metrics(scene.problem)
+    judged, collection = per_sample_errors(module, batch, 5), ErrorMetrics(scene.problem)
     collection.update(prediction, batch)
     wanted = collection.compute()
     assert float(judged.relative.max()) == pytest.approx(float(wanted["rel_L2_worst"]))
@@ -157,38 +143,27 @@ def test_per_sample_errors_equal_the_metrics(scene, batch):
     assert torch.allclose(judged.size, batch.displacement.norm(dim=2).amax(dim=1))
 
 
-def test_loads_with_the_largest_errors_of_both_kinds_and_a_typical_load_are_selected():
-    relative = torch.tensor([0.1, 0.5, 0.2, 0.9, 0.3, 0.4, 0.15])
-    largest = torch.tensor([0.7, 0.1, 0.8, 0.3, 0.9, 0.0, 0.05])
-    judged = PerLoadErrors(relative, largest, torch.full((7,), 0.25))
-    assert judged.select(1) == [3, 4, 2], "2 is the third of the five that are left"
-    assert judged.select(2) == [3, 1, 4, 2, 6], "neither twice"
-    assert judged.title(3) == (
-        "load 3, max displacement 0.25 L\nrelative L2 90 %: largest\nmax error 0.3 L: rank 4 of 7"
-    )
-    worst = torch.tensor([0.1, 0.9, 0.2, 0.3, 0.05])
-    judged = PerLoadErrors(worst, worst, worst)
-    assert judged.select(1) == [1, 3, 0], "a load with both largest errors is selected once"
-    assert judged.title(3).count("2nd largest") == 2
-    assert judged.select(3) == [1, 3, 2, 0, 4]
-
-
-def test_a_nan_prediction_has_the_largest_error():
-    errors = torch.tensor([0.1, torch.inf, torch.nan, 0.3])
-    judged = PerLoadErrors(errors, errors, torch.ones(4))
-    assert set(judged.select(1)[:2]) == {1, 2}
-
-
-def test_a_nan_prediction_is_drawn_without_a_mesh(scene, data, tmp_path):
+def test_a_single_load_with_a_nan_prediction_is_drawn_once_without_a_mesh(scene, data, tmp_path):
+    data.sizes["val"] = 1
     module = surrogate(scene)
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.fill_(torch.nan)
-    tutor = trainer(tmp_path, WorstCasePlots())
+    tutor = trainer(tmp_path, WorstCasePlots(every=2), epochs=2)
     tutor.fit(module, datamodule=data)
     found = events(tmp_path)
-    assert len(found.Images("validation/errors")) == 1
+    assert steps(found.Images("validation/errors")) == [2 * BATCHES - 1]
     assert not found.Tags()["tensors"]
+
+
+def test_meshes_can_be_left_out_and_numbers_are_at_least_one(scene, data, tmp_path):
+    trainer(tmp_path, WorstCasePlots(meshes=False)).fit(surrogate(scene), datamodule=data)
+    found = events(tmp_path)
+    assert found.Images("validation/shapes")
+    assert not found.Tags()["tensors"]
+    for option in ("every", "loads", "max_polygons"):
+        with pytest.raises(ValueError, match=f"{option} = 0 must be 1 or more"):
+            WorstCasePlots(**{option: 0})
 
 
 def test_pictures_do_not_change_the_training(scene, data, tmp_path):

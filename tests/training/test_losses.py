@@ -26,7 +26,7 @@ from dpl.training import (
     RMSELoss,
     Surrogate,
 )
-from dpl.training.losses import residual_norm
+from dpl.training.losses.residual import residual_norm
 
 LOSSES = sorted((Path(__file__).parents[2] / "conf" / "loss").glob("*.yaml"))
 
@@ -127,6 +127,11 @@ def test_the_negative_gradient_of_a_loss_is_finite_and_a_descent_direction(
     value = loss(near, few, physics)
     assert (value.shape, value.dtype) == ((), torch.float64)
     assert float(value) > 0 or isinstance(loss, PotentialEnergyLoss)
+    assert all(term.shape == () for term in loss.terms.values())
+    logged = {}
+    loss.on_train_batch_end(None, SimpleNamespace(log_dict=logged.update), None, None, 0)
+    assert set(logged) == {f"loss/{name}" for name in loss.terms}
+    assert not any(value.requires_grad for value in logged.values())
     slope = gradient(loss, near, few, physics)
     assert slope.isfinite().all()
     step = 1e-6 / float(slope.norm())
@@ -157,16 +162,6 @@ def test_a_loss_and_its_gradient_are_finite_where_elements_are_inverted(
         assert gradient(loss, prediction, few, physics).isfinite().all()
 
 
-def test_a_loss_logs_its_terms(loss, few, physics, near):
-    loss(near, few, physics)
-    assert all(term.shape == () for term in loss.terms.values())
-    logged = {}
-    module = SimpleNamespace(log_dict=logged.update)
-    loss.on_train_batch_end(None, module, None, None, 0)
-    assert set(logged) == {f"loss/{name}" for name in loss.terms}
-    assert not any(value.requires_grad for value in logged.values())
-
-
 def test_the_loss_of_a_batch_is_the_mean_over_samples_except_for_residual_weights(
     few, physics, near
 ):
@@ -186,26 +181,11 @@ def test_the_loss_of_a_batch_is_the_mean_over_samples_except_for_residual_weight
 def test_the_relative_exponent_applies_to_the_mean_square_of_a_sample(few, physics, near, relative):
     error = (near - few.displacement).square().mean(dim=(1, 2))
     size = few.displacement.square().mean(dim=(1, 2))
-    found = float(MSE(relative=relative, floor=0.0)(near, few, physics))
-    assert found == pytest.approx(float((error / size**relative).mean()), rel=1e-12)
-    found = float(RMSELoss(relative=relative, floor=0.0)(near, few, physics))
-    assert found == pytest.approx(float((error / size**relative).sqrt().mean()), rel=1e-9)
-
-
-def scaled_by_sample(near, few):
-    """Return errors and samples; each sample has a tenth of the size of the previous one."""
-    factor = 10.0 ** -torch.arange(4.0, dtype=torch.float64)[:, None, None]
-    return factor * near, few._replace(displacement=factor * few.displacement)
-
-
-@pytest.mark.parametrize("kind", [MSE, RMSELoss])
-def test_small_and_large_loads_have_equal_weight_only_for_exponent_one(few, physics, near, kind):
-    tiny, samples = scaled_by_sample(near, few)
-    whole, plain = kind(relative=1.0, floor=0.0), kind()
-    assert float(whole(tiny, samples, physics)) == pytest.approx(
-        float(whole(near, few, physics)), rel=1e-5
-    )
-    assert plain(tiny, samples, physics) < 0.9 * plain(near, few, physics)
+    for loss, expected in (
+        (MSE(relative=relative, floor=0.0), (error / size**relative).mean()),
+        (RMSELoss(relative=relative, floor=0.0), (error / size**relative).sqrt().mean()),
+    ):
+        assert float(loss(near, few, physics)) == pytest.approx(float(expected), rel=1e-9)
 
 
 @pytest.mark.parametrize("kind", [MSE, RMSELoss])
@@ -231,12 +211,8 @@ def test_the_gradient_of_rmse_loss_does_not_vanish_with_the_error(few, physics, 
         sizes[kind] = float(small / large)
     assert sizes[RMSELoss] == pytest.approx(1.0, rel=1e-3)
     assert sizes[MSE] == pytest.approx(1e-4, rel=1e-3)
-
-
-def test_the_gradient_of_rmse_loss_is_zero_at_the_reference_solution(few, physics):
     slope = gradient(RMSELoss(relative=0.8), few.displacement, few, physics)
-    assert not slope.any()
-    assert slope.isfinite().all()
+    assert not slope.any(), "it is zero at the reference solution, and finite"
 
 
 @pytest.mark.parametrize(
@@ -255,19 +231,31 @@ def test_a_loss_evaluates_finite_elements_no_more_than_its_gradient_needs(
     assert evaluations == evaluated[:1]
 
 
-def test_residual_losses_are_the_formulas_of_their_terms(few, physics, near):
-    error = (near - few.displacement).square().mean(dim=(1, 2))
-    norms = residual_norm(near, few, physics)
+def test_residual_losses_are_the_formulas_of_their_terms(scene, few, physics, near):
+    """The residual is relative to the largest modal force; that of L_r^* is a constant weight."""
+    problem = scene.problem
+    forces = problem.internal_force(near) - few.force
+    expected = [float(f[problem.free].norm()) / scene.loads.largest_force for f in forces]
+    norms, error = (
+        residual_norm(near, few, physics),
+        (near - few.displacement).square().mean((1, 2)),
+    )
+    assert norms.tolist() == pytest.approx(expected, rel=1e-10)
+    plain = gradient(MSE(), near, few, physics)
     formulas = [
-        (LrStar(), error.mean() * norms.mean()),
-        (LrStar(per_sample=True), (error * norms).mean()),
-        *((LrPlus(weight=w), error.mean() + w * norms.mean()) for w in (0.0, 1.0, 2.5)),
+        (LrStar(), error.mean() * norms.mean(), norms.mean() * plain),
+        (LrStar(per_sample=True), (error * norms).mean(), norms[:, None, None] * plain),
+        *((LrPlus(weight=w), error.mean() + w * norms.mean(), None) for w in (0.0, 1.0, 2.5)),
     ]
-    for loss, expected in formulas:
+    for loss, expected, slope in formulas:
         assert float(loss(near, few, physics)) == pytest.approx(float(expected), rel=1e-12)
         found = {name: float(term) for name, term in loss.terms.items()}
         parts = {"error": float(error.mean()), "residual": float(norms.mean())}
         assert found == pytest.approx(parts, rel=1e-12)
+        if slope is not None:
+            assert torch.allclose(gradient(loss, near, few, physics), slope, rtol=1e-12)
+    exact = fem.solve(scene.solver, few.load).displacement  # where the residual is almost zero
+    assert gradient(LrPlus(), exact, few, physics).isfinite().all()
 
 
 def test_a_limit_keeps_one_rough_sample_from_dominating_a_batch(few, physics, near):
@@ -278,37 +266,6 @@ def test_a_limit_keeps_one_rough_sample_from_dominating_a_batch(few, physics, ne
     loss = LrStar(error=error, limit=3.0)
     expected = error.errors(rough, few).mean() * norms.clamp(max=3 * norms.median()).mean()
     assert float(loss(rough, few, physics)) == pytest.approx(float(expected), rel=1e-12)
-
-
-def test_the_residual_is_relative_to_the_largest_modal_force(scene, few, physics, near):
-    problem = scene.problem
-    forces = problem.internal_force(near) - few.force
-    expected = [float(f[problem.free].norm()) / scene.loads.largest_force for f in forces]
-    assert residual_norm(near, few, physics).tolist() == pytest.approx(expected, rel=1e-10)
-
-
-def test_the_gradient_of_lr_star_is_the_residual_times_that_of_mse(few, physics, near):
-    norms = residual_norm(near, few, physics)
-    plain = gradient(MSE(), near, few, physics)
-    assert torch.allclose(gradient(LrStar(), near, few, physics), norms.mean() * plain, rtol=1e-12)
-    each = gradient(LrStar(per_sample=True), near, few, physics)
-    assert torch.allclose(each, norms[:, None, None] * plain, rtol=1e-12)
-
-
-def test_lr_plus_has_a_finite_gradient_at_the_reference_solution(scene, few, physics):
-    """The gradient of the norm is bounded where the residual is almost zero."""
-    exact = fem.solve(scene.solver, few.load).displacement
-    assert gradient(LrPlus(), exact, few, physics).isfinite().all()
-
-
-def test_the_weight_rises_over_the_warmup():
-    loss = LrPlus(weight=2.0, warmup_epochs=4)
-    assert loss.weight == 0.0
-    seen = []
-    for epoch in range(6):
-        loss.on_train_epoch_start(SimpleNamespace(current_epoch=epoch), None)
-        seen.append(loss.weight)
-    assert seen == [0.0, 0.5, 1.0, 1.5, 2.0, 2.0]
 
 
 def test_an_inverted_sample_has_the_largest_residual_and_no_gradient(few, physics, near, inverted):
@@ -379,13 +336,6 @@ def test_a_loss_replaces_the_stiffness_of_another_problem(few, physics, near, ma
     assert float(used(near, few, there)) != float(used(near, few, physics))
 
 
-def test_products_with_the_rest_stiffness_do_not_depend_on_the_device(scene, few):
-    """Other devices use torch's sparse matrices, which exist on the CPU as well."""
-    rest, free = RestStiffness(scene.problem), scene.problem.free
-    image = rest._on_device @ few.displacement[:, free].T
-    assert torch.allclose(rest.product(few.displacement)[:, free], image.T, rtol=1e-12, atol=1e-18)
-
-
 @pytest.mark.parametrize("loss", [EnergyNormLoss(), PotentialEnergyLoss()])
 def test_a_loss_is_pickled_without_its_matrices(loss, few, physics, near):
     value = loss(near, few, physics)
@@ -397,10 +347,17 @@ def test_a_loss_is_pickled_without_its_matrices(loss, few, physics, near):
 # ------------------------------------------------------------------ the energy, without answers
 
 
-def test_potential_energy_loss_does_not_read_reference_solutions(few, unanswered, physics, near):
-    value = PotentialEnergyLoss()(near, unanswered, physics)
-    assert value == PotentialEnergyLoss()(near, few, physics)
-    assert gradient(PotentialEnergyLoss(), near, unanswered, physics).isfinite().all()
+def test_potential_energy_loss_reads_no_reference_solution_and_weights_samples_alone(
+    few, unanswered, physics, near, inverted
+):
+    loss = PotentialEnergyLoss()
+    assert loss(near, unanswered, physics) == loss(near, few, physics)
+    slopes = gradient(loss, near, unanswered, physics)
+    mixed = torch.cat([near[:3], inverted[3:]])
+    mixed_slopes = gradient(loss, mixed, unanswered, physics)
+    assert torch.equal(mixed_slopes[:3], slopes[:3]), "an inverted sample does not change others"
+    assert mixed_slopes.isfinite().all()
+    assert (mixed_slopes[3] * inverted[3]).sum() > 0, "downhill is towards rest"
 
 
 def test_potential_energy_loss_is_relative_to_the_work_of_the_linear_solution(
@@ -463,14 +420,6 @@ def test_descent_from_inverted_samples_reaches_states_without_inversion(
     assert (problem.volume_ratio(u) > 0).all()
     loss(u, unanswered, physics)
     assert float(loss.terms["inverted"]) == 0
-
-
-def test_an_inverted_sample_does_not_change_the_others(unanswered, physics, near, inverted):
-    mixed = torch.cat([near[:3], inverted[3:]])
-    slope = gradient(PotentialEnergyLoss(), mixed, unanswered, physics)
-    assert torch.equal(slope[:3], gradient(PotentialEnergyLoss(), near, unanswered, physics)[:3])
-    assert slope[3].isfinite().all()
-    assert (slope[3] * inverted[3]).sum() > 0  # downhill is towards rest
 
 
 def test_potential_energy_loss_has_no_minimum_with_inverted_elements(few, make_scene):
@@ -547,24 +496,22 @@ def test_a_blended_loss_is_the_weighted_sum_of_its_parts(few, physics, near):
     assert seen == [0, 0, 0, 0.25, 0.5, 0.75, 1, 1]
 
 
-def test_a_loss_of_weight_zero_is_not_evaluated(few, physics, near, evaluations):
-    loss = BlendedLoss(MSE(), LrStar(), epochs=2)
+def test_both_parts_of_a_blended_loss_follow_the_epochs_and_none_is_evaluated_for_nothing(
+    few, physics, near, evaluations
+):
+    loss = BlendedLoss(MSE(), LrPlus(weight=2.0, warmup_epochs=4), epochs=2)
+    assert loss.second.weight == 0.0
     loss(near, few, physics)
     assert evaluations == []
     assert set(loss.terms) == {"weight", "first"}
-    loss.on_train_epoch_start(SimpleNamespace(current_epoch=2), None)
+    seen = []
+    for epoch in (1, 3, 4, 5):
+        loss.on_train_epoch_start(SimpleNamespace(current_epoch=epoch), None)
+        seen.append(loss.second.weight)
+    assert seen == [0.5, 1.5, 2.0, 2.0]
     loss(near, few, physics)
     assert evaluations == [4]
     assert set(loss.terms) == {"weight", "second", "second/error", "second/residual"}
-
-
-def test_the_weights_of_the_parts_of_a_blended_loss_change_too():
-    loss = BlendedLoss(MSE(), LrPlus(weight=2.0, warmup_epochs=4), epochs=2)
-    loss.on_train_epoch_start(SimpleNamespace(current_epoch=3), None)
-    assert loss.second.weight == 1.5
-
-
-def test_a_blended_loss_saves_the_work_that_both_parts_save():
     assert MSE().skipped_work() == [
         "no finite-element evaluation in training: the loss has no residual term"
     ]
@@ -573,23 +520,13 @@ def test_a_blended_loss_saves_the_work_that_both_parts_save():
 
 
 def test_a_trainer_changes_and_logs_the_weight(scene, data, tmp_path):
-    torch.manual_seed(0)
     module = Surrogate(
         FCNN(scene, width=8), BlendedLoss(MSE(), PotentialEnergyLoss(), epochs=2), scene
     )
-    seen = []
-
-    class Watch(L.Callback):
-        def on_train_epoch_end(self, trainer, module):
-            seen.append(float(trainer.callback_metrics["loss/weight"]))
-
     quiet = {"enable_progress_bar": False, "enable_model_summary": False, "logger": False}
-    L.Trainer(
-        accelerator="cpu",
-        max_epochs=4,
-        callbacks=[Watch()],
-        enable_checkpointing=False,
-        default_root_dir=tmp_path,
+    trainer = L.Trainer(
+        accelerator="cpu", max_epochs=2, enable_checkpointing=False, default_root_dir=tmp_path,
         **quiet,
-    ).fit(module, datamodule=data)
-    assert seen == [0.0, 0.5, 1.0, 1.0]
+    )  # fmt: skip
+    trainer.fit(module, datamodule=data)
+    assert float(trainer.callback_metrics["loss/weight"]) == 0.5

@@ -1,4 +1,4 @@
-"""Metrics against the formulas of the paper in NumPy."""
+"""Metrics against the formulas of the paper in NumPy, and the loads that are drawn."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ import torch
 
 from dpl import Sample
 from dpl.fem import Problem
-from dpl.training import MaxError, MeanError, MinSNR, MinVolumeRatio, RelativeL2, ResidualRatio
-from dpl.training.metrics import PerLoadErrors, default_metrics, median
+from dpl.training import ErrorMetrics
+from dpl.training.metrics import PerLoadErrors, median
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +42,33 @@ def by_hand(problem: Problem, prediction, batch):
     }
 
 
-def test_metrics_are_the_formulas(scene, prediction, batch):
-    found = default_metrics(scene.problem)
-    found.update(prediction, batch)
+def some(batch, rows):
+    return Sample(*(column[rows] for column in batch))
+
+
+def numbers(scene, prediction, batch):
+    """Return the metrics of predictions as numbers."""
+    metrics = ErrorMetrics(scene.problem)
+    metrics.update(prediction, batch)
+    return {name: float(value) for name, value in metrics.compute().items()}
+
+
+def test_metrics_of_a_batch_or_of_its_parts_are_the_formulas(scene, prediction, batch):
+    """Also those of several processes, whose states are merged."""
     expected = by_hand(scene.problem, prediction, batch)
-    numbers = {name: float(value) for name, value in found.compute().items()}
-    assert numbers == pytest.approx(expected, rel=1e-9)
+    assert numbers(scene, prediction, batch) == pytest.approx(expected, rel=1e-9)
+    parts, whole = [], ErrorMetrics(scene.problem)
+    for rows in (slice(0, 5), slice(5, 6), slice(6, 12)):
+        one, part = ErrorMetrics(scene.problem), ErrorMetrics(scene.problem)
+        for metrics in (one, part):
+            metrics.update(prediction[rows], some(batch, rows))
+        parts.append(part)
+        assert whole(prediction[rows], some(batch, rows)) == one.compute()
+    parts[0].merge_state(parts[1])
+    parts[0].merge_state(parts[2])
+    for metrics in (whole, parts[0]):
+        found = {name: float(value) for name, value in metrics.compute().items()}
+        assert found == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9])
@@ -64,126 +85,81 @@ def test_the_median_of_infinite_values_is_infinite_and_of_nan_is_nan():
     assert median(torch.tensor([1.0, nan, 3.0])).isnan()
 
 
-def test_batches_accumulate_in_the_forward_method(scene, prediction, batch):
-    """A collection that is called returns the metrics of the batch and accumulates them."""
-    found, whole = default_metrics(scene.problem), default_metrics(scene.problem)
-    whole.update(prediction, batch)
-    for start, end in ((0, 5), (5, 6), (6, 12)):
-        rows = prediction[start:end], Sample(*(column[start:end] for column in batch))
-        one = default_metrics(scene.problem)
-        one.update(*rows)
-        assert found(*rows) == one.compute()
-    assert {k: float(v) for k, v in found.compute().items()} == pytest.approx(
-        {k: float(v) for k, v in whole.compute().items()}, rel=1e-12
-    )
-
-
-def test_the_body_is_evaluated_once_per_batch(scene, prediction, batch, monkeypatch):
+def test_the_body_is_evaluated_once_per_batch_in_double_precision(
+    scene, prediction, batch, monkeypatch
+):
     calls, evaluate = [], Problem.evaluate
     monkeypatch.setattr(
         Problem, "evaluate", lambda *arguments: calls.append(1) or evaluate(*arguments)
     )
-    monkeypatch.setattr(Problem, "volume_ratio", None)
-    found = default_metrics(scene.problem).clone(prefix="val/")
-    for count in (1, 2, 3):
-        found.update(prediction, batch)
+    found = ErrorMetrics(scene.problem)
+    for count in (1, 2):
+        found.update(prediction.float(), batch)
         assert len(calls) == count
-    found.compute()
-    assert len(calls) == 3
-
-
-def test_errors_of_single_precision_predictions_are_computed_in_double_precision(
-    scene, prediction, batch
-):
-    found = default_metrics(scene.problem)
-    found.update(prediction.float(), batch)
     assert all(value.dtype == torch.float64 for value in found.compute().values())
+    assert len(calls) == 2
 
 
-def test_noise_of_a_tenth_of_the_signal_is_20_dB_and_printed_as_10(batch):
+def test_noise_of_a_tenth_of_the_signal_is_20_dB_and_printed_as_10(scene, batch):
     """10 log10 of power is 20 log10 of amplitude; the tables of the paper are in power dB."""
     scaled = batch.displacement * 1.0
     error = scaled.flip(0)
     error *= (scaled.flatten(1).norm(dim=1) / error.flatten(1).norm(dim=1))[:, None, None] / 10
-    shifted = Sample(batch.force, scaled - error, batch.young)
-    for printed, decibels in ((False, 20.0), (True, 10.0)):
-        snr = MinSNR(printed=printed)
-        snr.update(scaled, shifted)
-        assert float(snr.compute()) == pytest.approx(decibels, abs=1e-9)
+    found = numbers(scene, scaled, batch._replace(displacement=scaled - error))
+    assert found["SNR_min"] == pytest.approx(20.0, abs=1e-9)
+    assert found["SNR_min_printed"] == pytest.approx(10.0, abs=1e-9)
 
 
 def test_the_reference_solution_has_zero_residual_and_infinite_snr(scene, batch):
-    found = default_metrics(scene.problem)
-    found.update(batch.displacement, batch)
-    numbers = found.compute()
-    assert float(numbers["e_mean"]) == float(numbers["e_max"]) == 0.0
-    assert float(numbers["SNR_min"]) == torch.inf
-    assert float(numbers["residual"]) < scene.solver.tol
-    assert float(numbers["min_det_F"]) > 0
+    found = numbers(scene, batch.displacement, batch)
+    assert found["e_mean"] == found["e_max"] == 0.0
+    assert found["SNR_min"] == torch.inf
+    assert found["residual"] < scene.solver.tol
+    assert found["min_det_F"] > 0
 
 
 def test_an_inverted_prediction_has_a_negative_min_det_F(scene, batch):
     problem = scene.problem
     points = torch.where(problem.free, -1.5 * problem.points, 0.0).expand_as(batch.force)
-    volume = MinVolumeRatio(problem)
-    volume.update(points, batch)
-    assert float(volume.compute()) < 0
-    residual = ResidualRatio(problem)
-    residual.update(points, batch)
-    assert float(residual.compute()) > 1  # infinite, and not NaN
+    found = numbers(scene, points, batch)
+    assert found["min_det_F"] < 0
+    assert found["residual"] > 1  # infinite, and not NaN
 
 
 def test_the_metrics_of_a_nan_prediction_are_never_the_best(scene, batch):
-    broken = torch.full_like(batch.displacement, torch.nan)
-    found = default_metrics(scene.problem)
-    found.update(broken, batch)
-    numbers = {name: float(value) for name, value in found.compute().items()}
-    assert numbers["residual"] == torch.inf
-    assert numbers["min_det_F"] == -torch.inf
+    found = numbers(scene, torch.full_like(batch.displacement, torch.nan), batch)
+    assert found["residual"] == torch.inf
+    assert found["min_det_F"] == -torch.inf
     for name in ("e_mean", "e_max", "rel_L2_worst"):
-        assert not numbers[name] < 1e9
-
-
-METRICS = [MeanError, MaxError, MinSNR, RelativeL2, ResidualRatio, MinVolumeRatio]
-
-
-@pytest.mark.parametrize("kind", METRICS[:5])
-def test_a_metric_of_a_load_does_not_depend_on_its_batch(scene, prediction, batch, kind):
-    """The volume ratio is that of the whole batch, in `Problem.volume_ratio`."""
-    metric = kind(scene.problem) if kind is ResidualRatio else kind()
-    whole = metric.measure(prediction, batch)
-    assert whole.shape == (len(prediction),)
-    for k in range(len(prediction)):
-        one = metric.measure(
-            prediction[k : k + 1], Sample(*(column[k : k + 1] for column in batch))
-        )
-        assert float(one) == pytest.approx(float(whole[k]), rel=1e-12)
-
-
-def test_metrics_of_several_processes_cover_all_loads(prediction, batch):
-    """Concatenates the states like torchmetrics in two processes, without processes."""
-    parts = [MeanError(), MeanError()]
-    for part, rows in zip(parts, (slice(0, 5), slice(5, 12)), strict=True):
-        part.update(prediction[rows], Sample(*(column[rows] for column in batch)))
-    parts[0].merge_state(parts[1])
-    whole = MeanError()
-    whole.update(prediction, batch)
-    assert float(parts[0].compute()) == pytest.approx(float(whole.compute()), rel=1e-12)
-
-
-def test_metrics_that_agree_on_the_first_batch_are_computed_separately(scene, prediction, batch):
-    """At the reference solution e_mean and e_max are both zero and have equal states."""
-    found = default_metrics(scene.problem)
-    found.update(batch.displacement, batch)
-    found.update(prediction, batch)
-    expected = by_hand(scene.problem, prediction, batch)
-    numbers = {name: float(value) for name, value in found.compute().items()}
-    for name in ("e_max", "SNR_min", "SNR_min_printed", "rel_L2_worst"):
-        assert numbers[name] == pytest.approx(expected[name], rel=1e-9), name
-    assert numbers["e_mean"] == pytest.approx(expected["e_mean"] / 2, rel=1e-9)
+        assert not found[name] < 1e9
 
 
 # ------------------------------------------------------------------ which loads are shown
+
+
+def test_loads_with_the_largest_errors_of_both_kinds_and_a_typical_load_are_selected():
+    relative = torch.tensor([0.1, 0.5, 0.2, 0.9, 0.3, 0.4, 0.15])
+    largest = torch.tensor([0.7, 0.1, 0.8, 0.3, 0.9, 0.0, 0.05])
+    judged = PerLoadErrors(relative, largest, torch.full((7,), 0.25))
+    assert judged.select(1) == [3, 4, 2], "2 is the third of the five that are left"
+    assert judged.select(2) == [3, 1, 4, 2, 6], "neither twice"
+    assert judged.largest_absolute == 4
+    worst = torch.tensor([0.1, 0.9, 0.2, 0.3, 0.05])
+    judged = PerLoadErrors(worst, worst, worst)
+    assert judged.select(1) == [1, 3, 0], "a load with both largest errors is selected once"
+    assert judged.select(3) == [1, 3, 2, 0, 4]
+    one, two = torch.tensor([0.5]), torch.tensor([0.5, 0.7])
+    assert PerLoadErrors(one, one, one).select(2) == [0]
+    assert PerLoadErrors(two, two, two).select(1) == [1, 0]
+    same = torch.full((1000,), 0.5)  # enough loads for an unstable sort to permute them
+    assert PerLoadErrors(same, same, same).select(3) == [*range(6), 503]
+
+
+def test_a_nan_prediction_has_the_largest_error():
+    errors = torch.tensor([0.1, torch.inf, torch.nan, 0.3])
+    judged = PerLoadErrors(errors, torch.tensor([0.1, 0.8, torch.nan, 0.0]), torch.ones(4))
+    assert set(judged.select(1)[:2]) == {1, 2}
+    assert judged.largest_absolute == 2
 
 
 def test_the_title_of_a_load_contains_its_size_its_errors_and_their_ranks():
@@ -199,24 +175,3 @@ def test_the_title_of_a_load_contains_its_size_its_errors_and_their_ranks():
         ["2nd largest", "3rd largest"],
         ["3rd largest", "2nd largest"],
     ]
-
-
-def test_largest_absolute_is_the_load_with_the_largest_absolute_error():
-    relative, largest = torch.tensor([0.9, 0.1, 0.2]), torch.tensor([0.1, 0.8, 0.7])
-    assert PerLoadErrors(relative, largest, largest).largest_absolute == 1
-    assert (
-        PerLoadErrors(relative, torch.tensor([0.1, 0.8, torch.nan]), largest).largest_absolute == 2
-    )
-
-
-def test_equal_errors_are_in_the_order_of_the_loads():
-    """There are enough loads for an unstable sort to permute them."""
-    same = torch.full((1000,), 0.5)
-    assert PerLoadErrors(same, same, same).select(3) == [*range(6), 503]
-
-
-def test_few_loads_are_all_selected_once():
-    one = torch.tensor([0.5])
-    assert PerLoadErrors(one, one, one).select(2) == [0]
-    two = torch.tensor([0.5, 0.7])
-    assert PerLoadErrors(two, two, two).select(1) == [1, 0]

@@ -4,20 +4,29 @@ Processes are killed (SIGKILL) within a step or while writing a checkpoint, at a
 random time. The temporary folder is on another file system.
 """
 
+import contextlib
+import ctypes
 import hashlib
+import io
 import os
+import resource
+import runpy
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-import textwrap
 import time
+import traceback
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.global_hydra import GlobalHydra
 
+from dpl.training import Surrogate, checkpoints
+from dpl.training.callbacks import checkpointing
 from dpl.training.checkpoints import read
 
 ROOT = Path(__file__).parents[2]
@@ -49,16 +58,10 @@ class Noisy(nn.Module):
         return self.linear(x).view_as(force)
 """
 
-KILLER = textwrap.dedent(
-    """
-    import contextlib, io, os, runpy, signal, sys
-    from dpl.training import checkpoints
-    from dpl.training.surrogate import Surrogate
 
-    script, where, at = sys.argv[1], sys.argv[2], int(sys.argv[3])
-    sys.argv = [script, *sys.argv[4:]]
-    step, write = Surrogate.training_step, checkpoints.write
-    atomic_write = checkpoints.atomic_write
+def killing(where, at):
+    """Kill this process in the step `at`, or while it writes a checkpoint of the epoch `at`."""
+    step, write, atomic_write = Surrogate.training_step, checkpoints.write, checkpoints.atomic_write
     epoch = None
 
     def die():
@@ -71,7 +74,7 @@ KILLER = textwrap.dedent(
         return loss
 
     def writing(checkpoint, path):
-        global epoch
+        nonlocal epoch
         epoch = checkpoint["epoch"]
         write(checkpoint, path)
 
@@ -89,10 +92,30 @@ KILLER = textwrap.dedent(
     if where == "step":
         Surrogate.training_step = training_step
     else:
-        checkpoints.write, checkpoints.atomic_write = writing, half_file
-    runpy.run_path(script, run_name="__main__")
-    """
-)
+        checkpointing.write, checkpoints.atomic_write = writing, half_file
+
+
+def limiting(name, most):
+    """Limit the size of files from the third epoch on, which simulates a full disk."""
+    write = checkpoints.write
+
+    def full(checkpoint, path):
+        if path.name == name and checkpoint["epoch"] == 2:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
+        write(checkpoint, path)
+
+    checkpointing.write = full
+
+
+def mounting(folder):
+    """Mount a folder read-only for this process, since root can write to any folder."""
+    user, group = os.getuid(), os.getgid()
+    assert ctypes.CDLL(None).unshare(0x10020000) == 0  # CLONE_NEWUSER and CLONE_NEWNS
+    Path("/proc/self/setgroups").write_text("deny")
+    for name, number in (("uid_map", user), ("gid_map", group)):
+        Path("/proc/self", name).write_text(f"0 {number} 1")
+    for options in (["--bind", folder], ["-o", "remount,bind,ro"]):
+        subprocess.run(["mount", *options, folder], check=True)
 
 
 @pytest.fixture(scope="module")
@@ -149,17 +172,44 @@ def straight(elsewhere, script, overrides, home, ended):
 
 
 @pytest.fixture
-def killed(elsewhere, overrides, environment, home):
-    """Start a run that kills itself, see KILLER; return its folder."""
+def forked(elsewhere, overrides, home, monkeypatch):
+    """Train in a copy of this process after a preparation; return its status and stderr."""
+    monkeypatch.chdir(home)
+
+    def forked(prepare, name, net="fcnn"):
+        arguments, (read_end, write_end) = overrides(name, net), os.pipe()
+        if (child := os.fork()) == 0:
+            status = 1
+            try:
+                os.dup2(write_end, 2)
+                os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+                sys.stdout, sys.stderr = sys.__stdout__, sys.__stderr__
+                sys.argv = ["train.py", *arguments]
+                GlobalHydra.instance().clear()
+                prepare()
+                runpy.run_path(str(ROOT / "scripts/train.py"), run_name="__main__")
+            except SystemExit as end:
+                status = end.code or 0
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                sys.stderr.flush()
+                os._exit(status)
+        os.close(write_end)
+        with open(read_end) as pipe:
+            err = pipe.read()
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), err
+
+    return forked
+
+
+@pytest.fixture
+def killed(forked, home):
+    """Start a run that kills itself, see `killing`; return its folder."""
 
     def killed(name, net, where, at):
-        command = [sys.executable, "-c", KILLER, str(ROOT / "scripts/train.py"), where, str(at)]
-        env = environment()
-        env["PYTHONPATH"] = os.pathsep.join([str(home), env["PYTHONPATH"]])
-        ended = subprocess.run(
-            [*command, *overrides(name, net)], cwd=home, env=env, capture_output=True, text=True
-        )
-        assert ended.returncode == -signal.SIGKILL, ended.stderr[-2000:]
+        status, err = forked(partial(killing, where, at), name, net)
+        assert status == -signal.SIGKILL, err[-2000:]
         return home / name
 
     return killed
@@ -200,44 +250,17 @@ def assert_same(one, other):
         assert digest(one[part]) == digest(other[part]), part
 
 
-LIMITED = textwrap.dedent(
-    """
-    import resource, runpy, sys
-    from dpl.training import checkpoints
-    script, name, most = sys.argv[1:4]
-    sys.argv = [script, *sys.argv[4:]]
-    write = checkpoints.write
-
-    def full(checkpoint, path):
-        if path.name == name and checkpoint["epoch"] == 2:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (int(most), resource.RLIM_INFINITY))
-        write(checkpoint, path)
-
-    checkpoints.write = full
-    runpy.run_path(script, run_name="__main__")
-    """
-)
-
-
 @pytest.mark.parametrize(
     ("name", "most"),
     [pytest.param("best.safetensors", 0, marks=pytest.mark.slow), ("last.ckpt", 50_000)],
 )
-def test_a_full_disk_ends_training_with_one_line_and_intact_files(
-    straight, environment, overrides, home, name, most
-):
-    """From the third epoch on the size of files is limited, which simulates a full disk."""
-    straight("fcnn")
+def test_a_full_disk_ends_training_with_one_line_and_intact_files(forked, home, name, most):
     run = f"full-{name}-{most}"
-    command = [sys.executable, "-c", LIMITED, str(ROOT / "scripts/train.py"), name, str(most)]
-    ended = subprocess.run(
-        [*command, *overrides(run, "fcnn")],
-        cwd=home, env=environment(), capture_output=True, text=True,
-    )  # fmt: skip
-    assert ended.returncode == 2, ended.stderr[-2000:]
-    line = ended.stderr.strip().splitlines()[-1]
+    status, err = forked(partial(limiting, name, most), run)
+    assert status == 2, err[-2000:]
+    line = err.strip().splitlines()[-1]
     assert line.startswith("error: no space left"), line
-    assert "Traceback" not in ended.stderr
+    assert "Traceback" not in err
     assert last(home / run)["epoch"] == 1, "the checkpoint before is whole"
     assert read(home / run / "checkpoints/best.safetensors")["epoch"] <= 2
     left = {path.name for path in (home / run / "checkpoints").iterdir()}
@@ -246,38 +269,15 @@ def test_a_full_disk_ends_training_with_one_line_and_intact_files(
 
 @pytest.mark.skipif(os.system("unshare -rm true 2>/dev/null") != 0, reason="needs unshare")
 @pytest.mark.parametrize("below", [pytest.param(".", marks=pytest.mark.slow), "checkpoints"])
-def test_a_read_only_folder_ends_training_with_one_line(
-    straight, environment, overrides, home, below
-):
-    """The folder is mounted read-only, since root can write to any folder."""
-    straight("fcnn")
+def test_a_read_only_folder_ends_training_with_one_line(forked, home, below):
     run = home / f"read-only-{below}"
     (run / below).mkdir(parents=True)
-    mount = 'mount --bind $0 $0 && mount -o remount,bind,ro $0 && exec "$@"'
-    script = [sys.executable, str(ROOT / "scripts/train.py"), *overrides(run.name, "fcnn")]
-    ended = subprocess.run(
-        ["unshare", "-rm", "bash", "-c", mount, str(run / below), *script],
-        cwd=home, env=environment(), capture_output=True, text=True,
-    )  # fmt: skip
-    assert ended.returncode == 2, ended.stderr[-2000:]
-    line = ended.stderr.strip().splitlines()[-1]
+    status, err = forked(partial(mounting, str(run / below)), run.name)
+    assert status == 2, err[-2000:]
+    line = err.strip().splitlines()[-1]
     assert line.startswith("error: "), line
     assert "ead-only" in line or "no permission to write" in line, line
-    assert "Traceback" not in ended.stderr
-
-
-def test_two_uninterrupted_runs_are_equal(straight, script, overrides, home):
-    """This is the condition for the comparisons below."""
-    assert script("train", *overrides("again", "fcnn"), cwd=home).status == 0
-    assert_same(straight("fcnn"), last(home / "again"))
-
-
-def test_digests_detect_a_single_bit(straight):
-    weights = straight("fcnn")["state_dict"]
-    name = next(name for name in weights if name.endswith("weight"))
-    other = {**weights, name: weights[name].clone()}
-    other[name].view(torch.int32).view(-1)[0] ^= 1
-    assert digest(other) != digest(weights)
+    assert "Traceback" not in err
 
 
 @pytest.mark.parametrize("net", ["noisy", pytest.param("fcnn", marks=pytest.mark.slow)])
@@ -323,41 +323,8 @@ def test_wherever_a_run_is_killed_it_ends_bit_for_bit_the_same(
     run = script("train", *overrides(name, "fcnn"), "ckpt_path=last", cwd=home)
     assert run.status == 0, run.err
     assert_same(straight("fcnn"), last(folder))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("where", "at"), [("last.ckpt", 3), ("step", 2)])
-def test_a_network_with_dropout_ends_the_same_wherever_it_is_killed(
-    straight, killed, script, overrides, home, where, at
-):
-    name = f"noisy-{where.partition('.')[0]}{at}"
-    folder = killed(name, "noisy", where, at)
-    assert script("train", *overrides(name, "noisy"), "ckpt_path=last", cwd=home).status == 0
-    assert_same(straight("noisy"), last(folder))
-
-
-@pytest.mark.slow
-def test_a_run_killed_repeatedly_ends_bit_for_bit_the_same(
-    straight, killed, script, overrides, home
-):
-    """The run is killed twice and resumed twice."""
-    folder = killed("lives", "fcnn", "step", 3)
-    assert last(folder)["epoch"] == 0
-    command = [*overrides("lives", "fcnn"), "ckpt_path=last"]
-    for epochs, step in ((2, 7), (3, 9)):
-        before = last(folder)["epoch"]
-        resumed = killed_again(command, home, step)
-        assert resumed == -signal.SIGKILL
-        assert last(folder)["epoch"] == epochs > before
-    assert script("train", *command, cwd=home).status == 0
-    assert_same(straight("fcnn"), last(folder))
-
-
-def killed_again(command, home, step):
-    env = {**os.environ, "TMPDIR": ELSEWHERE, "OMP_NUM_THREADS": "1"}
-    env["PYTHONPATH"] = os.pathsep.join([str(home), str(ROOT)])
-    start = [sys.executable, "-c", KILLER, str(ROOT / "scripts/train.py"), "step", str(step)]
-    return subprocess.run([*start, *command], cwd=home, env=env, capture_output=True).returncode
+    left = sorted(path.name for path in (folder / "checkpoints").iterdir())
+    assert left == ["best.safetensors", "last.ckpt"], "no partial files"
 
 
 @pytest.mark.slow
@@ -380,13 +347,3 @@ def test_a_run_killed_at_a_random_time_ends_bit_for_bit_the_same(
     run = script("train", *overrides(name, "fcnn"), "ckpt_path=last", cwd=home)
     assert run.status == 0, run.err
     assert_same(straight("fcnn"), last(home / name))
-
-
-@pytest.mark.slow
-def test_a_resumed_run_removes_the_partial_files_of_the_killed_one(
-    straight, killed, script, overrides, home
-):
-    folder = killed("litter", "fcnn", "last.ckpt", 3)
-    assert script("train", *overrides("litter", "fcnn"), "ckpt_path=last", cwd=home).status == 0
-    left = sorted(path.name for path in (folder / "checkpoints").iterdir())
-    assert left == ["best.safetensors", "last.ckpt"]

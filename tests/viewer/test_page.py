@@ -327,12 +327,6 @@ def test_the_slider_of_youngs_modulus_has_a_unit_with_prefix(page):
     assert slider.value == 3.0
 
 
-def test_the_default_modulus_is_the_middle_of_its_distribution(make_scene, make_body):
-    decades = {"low": 1e6, "high": 1e10, "distribution": "log"}
-    assert make_body(make_scene(young=decades)).young == pytest.approx(1e8)
-    assert make_body(make_scene(young=[1e6, 5e6])).young == 3e6
-
-
 @of_bodies(["degree 2", "2D"])
 def test_feature_edges_replace_element_edges(page):
     node, surface = page._body_node, page.body.surface

@@ -27,13 +27,10 @@ def grasp(body):
     return body.grasp(tip_patch(body).held_nodes, UP, TURN)
 
 
-def test_interpolated_loads_start_and_end_at_the_given_loads(body):
+def test_requests_are_interpolated_with_their_moduli(body, grasp):
     old, new = body.sample(0), body.sample(1)
     assert interpolate(old, new, 1.0) is new
     assert torch.allclose(interpolate(old, new, 0.5).force, (old.force + new.force) / 2)
-
-
-def test_interpolated_grasps_have_interpolated_motions_and_moduli(body, grasp):
     young = 2 * body.young
     goal = body.with_moduli(body.grasp(grasp.nodes, 3 * UP, -TURN), young)
     assert interpolate(grasp, goal, 1.0) is goal
@@ -42,6 +39,14 @@ def test_interpolated_grasps_have_interpolated_motions_and_moduli(body, grasp):
     assert torch.allclose(middle.rotation, 0.5 * TURN)
     assert middle.young == pytest.approx(1.25 * body.young)
     assert torch.equal(middle.nodes, grasp.nodes)
+    rest = grasp.at(0 * grasp.coordinates)
+    scale = scale_of(rest, grasp)
+    assert scale == pytest.approx(float(torch.cat([UP, TURN]).norm())), "the larger motion"
+    assert distance(rest, grasp, scale) == pytest.approx(1)
+    assert distance(interpolate(rest, grasp, 0.75), grasp, scale) == pytest.approx(0.25)
+    softer = grasp.with_moduli(0.5 * grasp.young, grasp.parameters)
+    assert distance(softer, grasp, scale) == pytest.approx(0.5)
+    assert scale_of(rest, rest) == 1.0
 
 
 def test_a_request_continues_only_another_one_of_the_same_patch_and_kind(body, grasp):
@@ -55,17 +60,6 @@ def test_a_request_continues_only_another_one_of_the_same_patch_and_kind(body, g
     sliding = grasp._replace(sliding=True)
     assert sliding.continues(sliding.at(sliding.coordinates))
     assert not sliding.continues(grasp)
-
-
-def test_the_distance_of_grasps_is_relative_to_the_larger_motion(body, grasp):
-    rest = grasp.at(0 * grasp.coordinates)
-    scale = scale_of(rest, grasp)
-    assert scale == pytest.approx(float(torch.cat([UP, TURN]).norm()))
-    assert distance(rest, grasp, scale) == pytest.approx(1)
-    assert distance(interpolate(rest, grasp, 0.75), grasp, scale) == pytest.approx(0.25)
-    softer = grasp.with_moduli(0.5 * grasp.young, grasp.parameters)
-    assert distance(softer, grasp, scale) == pytest.approx(0.5)
-    assert scale_of(rest, rest) == 1.0
 
 
 @pytest.mark.parametrize("settings", [ViewSettings(), EXACT], ids=["prediction", "1e-8"])
@@ -82,6 +76,12 @@ def test_a_grasped_patch_moves_as_a_rigid_body(body, grasp, settings):
     lifted = np.sin(0.1) * arm[ahead, 0] + np.cos(0.1) * arm[ahead, 2]
     assert float(turned[ahead, 2]) == pytest.approx(float(lifted), abs=1e-3)
     assert frame.grasp is frame.answer
+    start, end = arrow_ends(body.surface, frame)
+    direction = (end - start) / np.linalg.norm(end - start)
+    force = np.linalg.norm(frame.grasp.force)
+    assert direction == pytest.approx(frame.grasp.force / force), "the arrow of the gripper"
+    equal = body.scene.loads.largest_force * float(grasp.nodes.sum()) ** 0.5  # along one axis
+    assert frame.amplitude == pytest.approx(force / (body.young * body.scene.force_unit * equal))
 
 
 def test_the_load_of_a_grasp_has_its_displacement(make_scene, make_body):
@@ -116,27 +116,13 @@ def test_newtons_iterates_of_a_grasp_converge_to_its_displacement(make_scene, ma
     assert torch.allclose(iterates[-1].displacement, frame.displacement, atol=1e-6 * 8.0)
 
 
-def test_the_error_of_a_grasp_is_against_the_same_motion(body, grasp):
+def test_the_error_of_a_grasp_is_against_the_same_motion(body, grasp, monkeypatch):
     values = body.solve(grasp, ViewSettings(quantity=ERROR)).values
     assert 0 < values.max() < 0.1 * float(UP[2]) * body.scene.length
     assert body.solve(grasp, ViewSettings(quantity=ERROR, tol=1e-8)).values.max() < 1e-5
-
-
-def test_the_amplitude_of_a_grasp_is_that_of_equal_forces_with_the_same_sum(body):
-    patch = tip_patch(body)
-    frame = body.solve(body.grasp(patch.held_nodes, UP, 0 * TURN), EXACT)
-    equal = body.scene.loads.largest_force * float(patch.held_nodes.sum()) ** 0.5  # along one axis
-    unit = body.young * body.scene.force_unit * equal
-    assert frame.amplitude == pytest.approx(float(np.linalg.norm(frame.grasp.force)) / unit)
-
-
-def test_the_arrow_of_a_grasp_has_the_direction_of_the_grippers_force(body, grasp):
-    frame = body.solve(grasp, EXACT)
-    start, end = arrow_ends(body.surface, frame)
-    direction = (end - start) / np.linalg.norm(end - start)
-    assert direction == pytest.approx(frame.grasp.force / np.linalg.norm(frame.grasp.force))
-    rest = body.solve(grasp.at(0 * grasp.coordinates), ViewSettings())
-    assert not len(arrow_ends(body.surface, rest))
+    monkeypatch.setattr("dpl.viewer.requests.GRASP_LIMIT_MS", 1e-3)
+    with pytest.raises(ValueError, match="no finite-element solution of this grasp after"):
+        body.solve(grasp, ViewSettings(quantity=ERROR))
 
 
 def fixed_patch(body):
@@ -190,20 +176,10 @@ def test_a_grasp_without_a_budget_has_the_limit_of_the_page(body, grasp):
     assert asked == [GRASP_LIMIT_MS, 20.0]
 
 
-def test_errors_without_a_reference_are_not_shown(body, grasp, monkeypatch):
-    monkeypatch.setattr("dpl.viewer.requests.GRASP_LIMIT_MS", 1e-3)
-    with pytest.raises(ValueError, match="no finite-element solution of this grasp after"):
-        body.solve(grasp, ViewSettings(quantity=ERROR))
-
-
-def test_held_nodes_are_free_nodes_of_the_boundary(body):
-    problem, patch = body.scene.problem, tip_patch(body, 2.0)
-    expected = problem.boundary & problem.free.any(dim=1)
-    assert torch.equal(patch.held_nodes, expected)
-    assert expected.sum() < len(expected)
-
-
 def test_a_hand_takes_a_patch_where_the_body_is_shown(body):
+    problem, whole = body.scene.problem, tip_patch(body, 2.0).held_nodes
+    assert torch.equal(whole, problem.boundary & problem.free.any(dim=1))
+    assert whole.sum() < len(whole)
     rotation = torch.zeros(3).double()
     controls = SimpleNamespace(
         radius=SimpleNamespace(value=0.3),

@@ -15,6 +15,9 @@ from dpl.commands import view
 from dpl.viewer.recording import FRAME_RATE
 
 pytest.importorskip("viser", reason="the extra viewer is not installed")
+
+from dpl.viewer.page import Page
+
 ADDRESS = r"the page is at http://127\.0\.0\.1:\d+/[\w-]{32}/  \(Ctrl-C ends it\)\n"
 
 
@@ -32,15 +35,17 @@ def home(start, members, tiny_training, tmp_path_factory):
     return home
 
 
-def test_the_page_prints_its_address_and_ctrl_c_ends_all_processes(start, members, home):
+def test_the_page_prints_its_address_and_ctrl_c_ends_it(script, home, monkeypatch):
     assert (home / "runs/a/evaluation.json").is_file(), "the page is served at the end"
-    process = start("view", "run=runs/a", "port=0", cwd=home)
-    line = process.stdout.readline()
-    assert re.fullmatch(ADDRESS, line), line + process.stderr.read()
-    os.kill(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=240)
-    assert (process.returncode, out, err) == (130, "", "interrupted\n")
-    assert not members(process.pid)
+
+    def refresh(page):
+        assert page.frame is None or page.frame.answer is not None
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Page, "refresh", refresh)
+    ended = script("view", "run=runs/a", "port=0", cwd=home)
+    assert (ended.status, ended.err) == (130, "interrupted\n")
+    assert re.fullmatch(ADDRESS, ended.out)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])

@@ -40,24 +40,16 @@ def make_worker(body, shown, monkeypatch):
         assert not worker.is_alive()
 
 
-def test_the_last_frame_has_the_most_recent_load(make_worker, body, shown):
-    worker = make_worker(smoothing_time=0.05)
-    load = body.sample(1)
-    worker.submit(lambda: load)
-    assert worker.wait(LONG)
-    assert shown[-1].request is load
-    assert len(shown) > 3, "the load is smoothed"
-    sizes = [float(frame.request.force.norm()) for frame in shown]
-    assert sizes == sorted(sizes)
-
-
-def test_the_load_approaches_zero_load_in_a_few_frames(make_worker, body, shown):
-    worker = make_worker(smoothing_time=0.05)
-    for make in (lambda: body.sample(1), body.zero_load):
+def test_loads_are_smoothed_on_the_way_to_the_most_recent_one(make_worker, body, shown):
+    worker, load = make_worker(smoothing_time=0.05), body.sample(1)
+    for goal in (load, body.zero_load()):
         before = len(shown)
-        worker.submit(make)
+        worker.submit(lambda goal=goal: goal)
         assert worker.wait(LONG)
+        assert shown[-1].request is goal
         assert 3 < len(shown) - before < 60
+        sizes = [float(frame.request.force.norm()) for frame in shown[before:]]
+        assert sizes == sorted(sizes, reverse=goal is not load)
     assert shown[-1].answer.method == "rest"
 
 
@@ -87,13 +79,23 @@ def test_the_motion_of_a_grasped_patch_is_smoothed(make_worker, body, shown, pat
     assert all(torch.equal(frame.request.nodes, patch.held_nodes) for frame in shown[before:])
 
 
-def test_there_are_no_frames_between_a_load_and_a_grasp(make_worker, body, shown, patch):
+def test_there_is_one_frame_where_nothing_can_be_interpolated(make_worker, body, shown, patch):
+    """Between a load and a grasp, for new settings of the same load, and without smoothing."""
     worker = make_worker(smoothing_time=0.05)
-    for make in (lambda: lifted(body, patch, 0.05), body.zero_load):
+    for make, settings in (
+        (lambda: lifted(body, patch, 0.05), None),
+        (body.zero_load, None),
+        (None, ViewSettings(tol=1e-6)),
+    ):
         before = len(shown)
-        worker.submit(make)
+        worker.submit(make, settings)
         assert worker.wait(LONG)
         assert len(shown) == before + 1
+    assert shown[-1].converged
+    before, worker = len(shown) + 1, make_worker(smoothing_time=0.0)
+    worker.submit(lambda: body.sample(1))
+    assert worker.wait(LONG)
+    assert len(shown) == before + 1
 
 
 def test_newton_is_compared_with_a_grasp(make_worker, body, shown, patch):
@@ -122,24 +124,6 @@ def test_the_time_of_a_solve_is_known_while_it_lasts(make_worker, body):
     end.set()
     assert worker.wait(LONG)
     assert worker.solving_time == 0
-
-
-def test_new_settings_for_the_same_load_give_one_frame(make_worker, body, shown):
-    worker = make_worker(smoothing_time=0.05)
-    worker.submit(lambda: body.sample(1))
-    assert worker.wait(LONG)
-    before = len(shown)
-    worker.submit(settings=ViewSettings(tol=1e-6))
-    assert worker.wait(LONG)
-    assert len(shown) == before + 1
-    assert shown[-1].converged
-
-
-def test_without_smoothing_each_load_gives_one_frame(make_worker, body, shown):
-    worker = make_worker(smoothing_time=0.0)
-    worker.submit(lambda: body.sample(1))
-    assert worker.wait(LONG)
-    assert len(shown) == 2
 
 
 def test_of_many_requests_only_the_most_recent_is_solved(make_worker, body, shown):

@@ -39,20 +39,17 @@ BODIES = {
 
 
 @pytest.mark.parametrize("name", BODIES)
-def test_the_surface_of_a_body_is_closed(name):
+def test_the_surface_of_a_body_is_closed_and_has_its_area(name):
+    """Corners go around each facet; quadrilaterals with crossed sides would have less area."""
     mesh, facets, corners = BODIES[name]
     polygons = surface(mesh)
     assert polygons.shape == (facets, corners)
-    assert set(edges(polygons).values()) == {2}
     assert len(mesh.boundary_facets()) == facets
     assert set(polygons.ravel()) == set(mesh.boundary_nodes())
-
-
-@pytest.mark.parametrize("name", BODIES)
-def test_the_surface_has_the_area_of_the_body(name):
-    """Corners go around each facet; quadrilaterals with crossed sides would have less area."""
-    mesh, *_ = BODIES[name]
-    assert area(mesh.p.T, surface(mesh)) == pytest.approx(2 * (4 * 2 + 4 * 1 + 2 * 1))
+    for faces in (polygons, triangles(polygons)):
+        assert area(mesh.p.T, faces) == pytest.approx(2 * (4 * 2 + 4 * 1 + 2 * 1))
+        assert set(edges(faces).values()) == {2}
+    assert triangles(polygons).shape == (facets * (corners - 2), 3)
 
 
 def test_the_surface_of_a_curved_body_uses_its_vertices():
@@ -116,17 +113,6 @@ def test_texts_of_a_figure_neither_overlap_nor_leave_it(scene, batch, upright):
         assert sum(place.overlaps(other) for other in places.values()) == 1, text
 
 
-def test_predictions_and_reference_lie_within_their_panels(scene, batch):
-    truth = batch.displacement[:1]
-    figure = plot_deformed(scene.problem, truth, [("network", 1.2 * truth)])
-    points = scene.problem.points.numpy()
-    (low, high), (left, right) = (figure.axes[1].get_ylim(), figure.axes[1].get_xlim())
-    for factor in (0.0, 1.0, 1.2):
-        flat, _ = project(points + factor * truth[0].numpy())
-        assert left <= flat[:, 0].min() < flat[:, 0].max() <= right
-        assert low <= flat[:, 1].min() < flat[:, 1].max() <= high
-
-
 def test_near_points_are_nearer_to_the_viewer():
     flat, depth = project(np.array([[0.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]))
     assert depth[1] > depth[0], "the view is from the side of negative y"
@@ -134,10 +120,20 @@ def test_near_points_are_nearer_to_the_viewer():
     assert np.linalg.norm(np.column_stack([flat, depth]), axis=1) == pytest.approx([0, 1, 1])
 
 
-def test_an_exact_prediction_has_one_colour(scene, batch):
+def test_a_prediction_lies_within_its_panel_in_the_colours_of_its_error(scene, batch):
     truth = batch.displacement[:1]
-    figure = plot_deformed(scene.problem, truth, [("network", truth)])
-    assert not np.ptp(faces(figure.axes[1]), axis=0).any(), "all polygons have the same colour"
+    shown = [("network", 1.2 * truth), ("exact", truth), ("shifted", truth + 0.1)]
+    figure = plot_deformed(scene.problem, truth, shown)
+    points = scene.problem.points.numpy()
+    (low, high), (left, right) = (figure.axes[1].get_ylim(), figure.axes[1].get_xlim())
+    for factor in (0.0, 1.0, 1.2):
+        flat, _ = project(points + factor * truth[0].numpy())
+        assert left <= flat[:, 0].min() < flat[:, 0].max() <= right
+        assert low <= flat[:, 1].min() < flat[:, 1].max() <= high
+    assert not np.ptp(faces(figure.axes[2]), axis=0).any(), "all polygons have the same colour"
+    assert figure.axes[-1].get_yscale() == "linear", "errors of similar size"
+    logarithmic = plot_deformed(scene.problem, truth, shown[2:], logarithmic=True)
+    assert logarithmic.axes[-1].get_yscale() == "log"
 
 
 def test_a_prediction_that_is_not_finite_is_left_out(scene, batch):
@@ -162,16 +158,6 @@ def test_nodes_with_larger_errors_are_brighter(make_scene, background):
     light = faces(figure.axes[1])[:, :3] @ [0.3, 0.6, 0.1]
     assert touched.sum() == 2
     assert light[touched].min() > light[~touched].max() + 0.3
-
-
-def test_all_scales_can_be_logarithmic(scene, batch):
-    """Errors of similar size have a linear scale, unless a logarithmic one is requested."""
-    truth = batch.displacement[:1]
-    wrong = [("network", truth + 0.1)]
-    linear = plot_deformed(scene.problem, truth, wrong)
-    logarithmic = plot_deformed(scene.problem, truth, wrong, logarithmic=True)
-    assert linear.axes[-1].get_yscale() == "linear"
-    assert logarithmic.axes[-1].get_yscale() == "log"
 
 
 def test_upright_figures_have_one_row_per_load(make_scene):
@@ -199,15 +185,6 @@ def test_many_predictions_of_one_load_continue_in_a_second_line(scene, batch):
     boxes = [text.get_window_extent() for text in texts if text.get_text()]
     assert len(boxes) == 6 + 5
     assert all(sum(box.overlaps(other) for other in boxes) == 1 for box in boxes)
-
-
-@pytest.mark.parametrize("name", BODIES)
-def test_triangles_cover_the_same_area_as_polygons(name):
-    mesh, facets, corners = BODIES[name]
-    found = triangles(surface(mesh))
-    assert found.shape == (facets * (corners - 2), 3)
-    assert area(mesh.p.T, found) == pytest.approx(area(mesh.p.T, surface(mesh)))
-    assert set(edges(found).values()) == {2}
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
@@ -276,12 +253,8 @@ def test_a_body_is_drawn_at_its_deformed_nodes_in_the_colours_of_its_values(dim)
     assert ax.get_xlim() == (pytest.approx(0.0), pytest.approx(1.3))
     assert scale.get_clim() == (0.0, 1.0)
     assert len(np.unique(faces, axis=0)) > 1
-
-
-def test_a_body_without_values_is_grey_and_undeformed():
-    problem = Problem.build(rectangle([2.0, 1.0], [3, 2]), NeoHookeanLn(0.3), fixed=Plane(0, "min"))
-    ax = Figure().add_subplot()
+    ax = Figure().add_subplot(projection="3d" if dim == 3 else None)
     draw_body(ax, problem)
     (drawn,) = ax.collections
-    assert len(np.unique(drawn.get_facecolor()[:, :3])) == 1
-    assert ax.get_xlim() == (0.0, 1.0)
+    assert len(np.unique(drawn.get_facecolor()[:, :3])) == 1 or dim == 3, "grey"
+    assert ax.get_xlim()[1] - ax.get_xlim()[0] == pytest.approx(1.0), "undeformed"

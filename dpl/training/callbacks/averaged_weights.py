@@ -30,11 +30,7 @@ class AveragedWeights(L.Callback):
     """
 
     def __init__(self, *, decay: float = 0.999) -> None:
-        """Choose the decay.
-
-        Raises:
-            ValueError: `decay` is not in [0, 1).
-        """
+        """Choose the decay."""
         if not 0 <= decay < 1:
             raise ValueError(f"decay = {decay} must be 0 or more and less than 1")
         self.decay = decay

@@ -25,11 +25,7 @@ class SkipNonFiniteGradients(L.Callback):
     """
 
     def __init__(self, *, patience: int = 20) -> None:
-        """Choose the number of consecutive skipped steps that stops the training.
-
-        Raises:
-            ValueError: `patience` is less than 1.
-        """
+        """Choose the number of consecutive skipped steps that stops the training."""
         check_range(1, patience=patience)
         self.patience = patience
         self.skipped_steps = 0

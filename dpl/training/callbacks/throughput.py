@@ -1,4 +1,4 @@
-"""Log the samples per second and the memory of a training."""
+"""Log the samples per second and the memory of a training, and record its duration."""
 
 import os
 import time
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dpl.data import DataModule
+from dpl.system.files import append_jsonl
 
 
 class ThroughputMonitor(L.Callback):
@@ -60,6 +61,37 @@ class ThroughputMonitor(L.Callback):
             sums["memory/gpu"] = torch.cuda.max_memory_allocated(pl_module.device) / 1e9
         pl_module.log_dict(sums, sync_dist=True, reduce_fx="sum")
         pl_module.log_dict(means, sync_dist=True)
+
+
+class TrainingTime(L.Callback):
+    """Appends a line to `training.jsonl` at the end of each session of a training.
+
+    The line holds the wall time with bases and validations but without data generation
+    [s], the number of optimiser steps, the number of threads and the device.
+    """
+
+    def __init__(self, *, folder: str | Path) -> None:
+        """Choose the folder of the run."""
+        self.path = Path(folder) / "training.jsonl"
+        self._start = 0.0
+
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """Start the clock."""
+        self._start = time.perf_counter()
+
+    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        """Write the line, also that of an interrupted session."""
+        if trainer.is_global_zero and self._start:
+            line = {
+                "seconds": round(time.perf_counter() - self._start, 3),
+                "steps": trainer.global_step,
+                "threads": torch.get_num_threads(),
+                "device": str(trainer.strategy.root_device),  # the module may have left it
+            }
+            append_jsonl(self.path, line)
+            self._start = 0.0
+
+    on_exception = on_fit_end
 
 
 def resident_memory() -> float:

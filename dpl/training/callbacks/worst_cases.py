@@ -13,7 +13,7 @@ from dpl.fem.postprocess import coarse, triangles
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.training.callbacks.tensorboard import last_step, tensorboard_writers
-from dpl.training.metrics import MaxError, PerLoadErrors, RelativeL2
+from dpl.training.metrics import PerLoadErrors, largest_errors, relative_errors
 from dpl.visualization import error_colours, plot_deformed, plot_errors
 
 if TYPE_CHECKING:
@@ -47,9 +47,6 @@ class WorstCasePlots(L.Callback):
             loads: Number of loads drawn for each kind of error.
             meshes: Also write meshes.
             max_polygons: Maximum number of polygons of a surface; larger meshes are coarsened.
-
-        Raises:
-            ValueError: A number is less than 1.
         """
         check_range(1, every=every, loads=loads, max_polygons=max_polygons)
         self.loads = loads
@@ -130,12 +127,11 @@ class WorstCasePlots(L.Callback):
 
 def per_sample_errors(module: Any, samples: Sample, batch_size: int) -> PerLoadErrors:
     """Return the errors of a surrogate on samples (S, N, D), evaluated in batches."""
-    relative, largest = RelativeL2(), MaxError()
     parts = []
     for columns in zip(*(column.split(batch_size) for column in samples), strict=True):
         batch = Sample(*columns)
         prediction = _predict(module, batch)
-        errors = (metric.measure(prediction, batch) for metric in (relative, largest))
+        errors = relative_errors(prediction, batch), largest_errors(prediction, batch)
         parts.append((*errors, batch.displacement.norm(dim=2).amax(dim=1)))
     return PerLoadErrors(*(torch.cat(column) for column in zip(*parts, strict=True)))
 

@@ -26,9 +26,6 @@ class EnergyNormLoss(Loss):
             relative: Divide the error of each sample by the energy of its displacement; otherwise
                 by the mean energy of the batch.
             floor: See `clamp_scale`; has no effect without `relative`.
-
-        Raises:
-            ValueError: `floor` is out of range.
         """
         super().__init__()
         check_range(0, 1, floor=floor)
@@ -71,9 +68,6 @@ class PotentialEnergyLoss(Loss):
 
         Args:
             floor: See `clamp_scale`.
-
-        Raises:
-            ValueError: `floor` is out of range.
         """
         super().__init__()
         check_range(0, 1, floor=floor)

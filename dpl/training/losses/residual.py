@@ -39,9 +39,6 @@ class LrStar(Loss):
             limit: Largest residual norm over the median of its batch; larger ones count as that.
                 None: no limit. Almost inverted elements have residuals that are thousands of times
                 larger than usual, so that a few batches dominate the momentum of an optimiser.
-
-        Raises:
-            ValueError: `limit` is less than 1.
         """
         super().__init__()
         if limit is not None:
@@ -73,9 +70,6 @@ class LrPlus(Loss):
         Args:
             weight: Final factor on the residual; the paper has 1.
             warmup_epochs: Number of epochs in which the factor rises linearly from zero.
-
-        Raises:
-            ValueError: A number is negative.
         """
         super().__init__()
         check_range(0, weight=weight, warmup_epochs=warmup_epochs)
