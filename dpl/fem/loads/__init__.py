@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from dpl.fem.loads.mixture import MixtureLoads
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
-    from dpl.fem.loads.options import option
     from dpl.fem.loads.patch import PatchLoads
     from dpl.fem.loads.point import PointLoads
     from dpl.fem.loads.sampling import (
@@ -26,5 +25,6 @@ if TYPE_CHECKING:
     )
     from dpl.fem.loads.sized import SizedLoads
     from dpl.fem.loads.surface import SurfaceLoads
+    from dpl.fem.options import option
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -56,11 +56,7 @@ class CombinedLoads(SizedLoads):
 
     @property
     def largest_force(self) -> float:
-        """Norm of the largest force [-].
-
-        Raises:
-            ValueError: The loads have a range of moduli, or no force acts on a free node.
-        """
+        """Norm of the largest force [-]."""
         size = self.largest_size
         if not (norm := size * self.unit_force) > 0:
             raise ValueError("these loads act on fixed nodes only; they must act on a free node")
@@ -72,7 +68,6 @@ class CombinedLoads(SizedLoads):
         return (self.shapes != 0).any(dim=0) & self.problem.free
 
     def force_at(self, point: Array) -> Tensor:
-        """Return the force (N, D) [-] of a point (n_force,) of the unit cube."""
         return torch.tensordot(torch.from_numpy(self.coefficients_at(point)), self.shapes, dims=1)
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from dpl.fem.loads.family import RandomLoads
 from dpl.fem.loads.fit import amplitudes
-from dpl.fem.loads.options import DIMENSIONLESS, declared, option, shown
 from dpl.fem.loads.sampling import Array, direction
+from dpl.fem.options import DIMENSIONLESS, declared, option, shown
 from dpl.fem.solvers.linear import LinearSolver
 
 MIN_DEFLECTION = 1e-12  # below it the displacement is rounding error [-]
@@ -39,11 +39,7 @@ class SizedLoads(RandomLoads):
 
     @property
     def given_sizes(self) -> Array | None:
-        """Smallest and largest size in the options, (2,) [-]; None if `deflection` decides.
-
-        Raises:
-            ValueError: The loads have a range of moduli.
-        """
+        """Smallest and largest size in the options, (2,) [-]; None if `deflection` decides."""
         name, units = self.size_option, self.problem.units
         if (value := getattr(self, name)) is None:
             return None
@@ -61,11 +57,7 @@ class SizedLoads(RandomLoads):
 
     @cached_property
     def sizes(self) -> tuple[float, float]:
-        """Smallest and largest size [-].
-
-        Raises:
-            ValueError: The loads have a range of moduli, or do not deflect the body.
-        """
+        """Smallest and largest size [-]."""
         if (given := self.given_sizes) is not None:
             return float(given[0]), float(given[1])
         unit = self.unit_deflection

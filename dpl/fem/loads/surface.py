@@ -28,11 +28,7 @@ class SurfaceLoads(RandomLoads):
 
     @cached_property
     def facets(self) -> NDArray[np.int_]:
-        """Numbers of the boundary facets on which these loads act, (E,).
-
-        Raises:
-            ValueError: The region contains no boundary facet.
-        """
+        """Numbers of the boundary facets on which these loads act, (E,)."""
         problem = self.problem
         if self.region is None:
             return np.asarray(problem.mesh.boundary_facets())
@@ -41,11 +37,7 @@ class SurfaceLoads(RandomLoads):
 
     @cached_property
     def loadable_dofs(self) -> Tensor:
-        """Free degrees of freedom of the nodes of `facets`, (N, D), boolean.
-
-        Raises:
-            ValueError: There are none.
-        """
+        """Free degrees of freedom of the nodes of `facets`, (N, D), boolean."""
         nodes = torch.zeros(self.problem.shape[0], dtype=torch.bool)
         nodes[self.problem.basis.get_dofs(self.facets).all()] = True
         loadable = nodes[:, None] & self.problem.free

@@ -23,10 +23,6 @@ def finger(
     Args:
         size: Lengths along the finger, across it and upwards [m].
         cells: Numbers of cells along these sides, at least 3, 3 and 4, the last one even.
-
-    Raises:
-        ValueError: A size or a number of cells is out of range.
-        MemoryError: The mesh would not fit in memory.
     """
     if len(cells) != 3 or cells[0] < 3 or cells[1] < 3 or cells[2] < 4 or cells[2] % 2:
         raise ValueError(f"cells = {list(cells)} must be at least [3, 3, 4], the last one even")

@@ -26,10 +26,6 @@ def box(size: Sequence[float], nodes: Sequence[int], cell: str = "hexahedron") -
         size: Lengths of the 3 sides [m].
         nodes: Numbers of vertices along the sides, at least 2.
         cell: "hexahedron", or "tetra" for six Kuhn tetrahedra per hexahedron.
-
-    Raises:
-        ValueError: A size or a number of nodes is out of range, or `cell` is unknown.
-        MemoryError: The mesh would not fit in memory.
     """
     kinds = {"hexahedron": skfem.MeshHex, "tetra": skfem.MeshTet}
     return grid(kinds, size, nodes, cell)
@@ -42,10 +38,6 @@ def rectangle(size: Sequence[float], nodes: Sequence[int], cell: str = "quad") -
         size: Lengths of the 2 sides [m].
         nodes: Numbers of vertices along the sides, at least 2.
         cell: "quad", or "triangle" for two triangles per quadrilateral.
-
-    Raises:
-        ValueError: A size or a number of nodes is out of range, or `cell` is unknown.
-        MemoryError: The mesh would not fit in memory.
     """
     kinds = {"quad": skfem.MeshQuad, "triangle": skfem.MeshTri}
     return grid(kinds, size, nodes, cell)
