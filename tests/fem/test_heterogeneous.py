@@ -105,14 +105,6 @@ def test_a_bar_of_two_laws_in_series_has_the_sum_of_their_strains():
     assert u[0, x > 0.99, 0].numpy() == pytest.approx(stress * (0.5 / 4 + 0.5), rel=1e-9)
 
 
-@pytest.mark.parametrize("pair", PAIRS)
-def test_newton_solves_bodies_of_several_laws(pair):
-    problem = body(*PAIRS[pair])
-    solution = fem.solve(fem.Newton(problem), end_load(problem))
-    assert solution.converged.all()
-    assert solution.displacement.abs().max() > 0.01
-
-
 def test_a_field_of_stiffness_is_that_of_its_values():
     def stiffness(points):
         return 1 + 9 * (points[:, 0] < 0.5)

@@ -10,7 +10,7 @@ from solving import load_of
 from torch import Tensor
 
 from benchmarks.verification.bodies import balanced, mean, slender
-from benchmarks.verification.refinement import COOK, FINER, OTHERS, SIDES, at, membrane
+from benchmarks.verification.refinement import FINER, OTHERS, SIDES, at, membrane
 from benchmarks.verification.rods import BENT, KINDS, LOCKED, SAME
 from benchmarks.verification.twisted import TWIST, twisted
 from dpl import fem
@@ -128,15 +128,6 @@ def test_membrane_of_cook_rises_as_tabulated(law, degree, count, printed):
         assert at(problem, u, (48, 60)) == (digits("-13.8264"), digits("13.7505"))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("degree", "level"), [(1, 4), (1, 5), (2, 3)])
-def test_membrane_of_cook_rises_as_printed_by_deal_ii(degree, level):
-    """Cook's membrane: the four digits of deal.II's code gallery, 0.5 % on the finest meshes."""
-    rise = at(*membrane(K4, SIDES[level], degree), (48, 52))[1]
-    assert f"{rise:.2f}" == COOK[degree].split()[level]
-    assert rise == pytest.approx(14.74, rel=0.02 if degree == 1 else 5e-3)
-
-
 # dolfinx tutorial, hyperelasticity: degree, n -> u of (20, 1, 1) [m], plain iterations
 DOLFINX = {
     (2, 1): (-0.456847, -1.8e-5, -4.554805),
@@ -182,42 +173,6 @@ def test_column_follows_the_rotation_of_its_end(cells, degree):
     assert found[0] == pytest.approx(torque, rel=1e-9)
     assert found[1] == pytest.approx(axial, rel=2e-9)
     assert found[2] == pytest.approx(energy, rel=1e-10)
-
-
-# The paper's beam, rows of quadratic elements: cells, q -> u_z of the corner [m]
-BEAMS = {
-    ((8, 2), 5): -7.32678,
-    ((8, 2), 40): -49.67143,
-    ((16, 4), 5): -7.36089,
-    ((16, 4), 20): -28.3413,
-}
-
-
-def sag(beam, pull, corner, law: fem.Material, cells: tuple[int, int], q: float) -> float:
-    """Return u_z of the corner [m] of the paper's beam in hex27."""
-    problem = beam(law, *cells, degree=2)
-    answer = fem.solve(fem.Newton(problem, tol=1e-10), load_of(pull(problem, q)))
-    assert answer.status.item() == fem.Status.CONVERGED
-    return 100 * corner(problem, answer.displacement)[2].item()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("cells", "q"), BEAMS)
-def test_beam_of_quadratic_elements_bends_as_tabulated(beam, pull, corner, cells, q):
-    """The paper's beam; the other rows are in test_newton."""
-    assert sag(beam, pull, corner, SVK, cells, q) == pytest.approx(BEAMS[cells, q], abs=5.1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("q", "limit", "within"), [(20, -28.387, 0.02), (40, -49.955, 0.03)])
-def test_beams_of_quadratic_elements_tend_to_the_tabulated_limit(
-    beam, pull, corner, q, limit, within
-):
-    """The paper's beam: Richardson's limit of 4, 8 and 16 cells."""
-    a, b, c = (sag(beam, pull, corner, SVK, n, q) for n in ((4, 1), (8, 2), (16, 4)))
-    rate = (b - a) / (c - b)
-    assert rate > 2
-    assert c + (c - b) / (rate - 1) == pytest.approx(limit, abs=within / 10)
 
 
 @pytest.mark.slow
