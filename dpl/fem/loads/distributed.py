@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from dpl.fem.assembly.follower_pressure import PressureSurface
-from dpl.fem.loads.combined import CombinedLoads, VectorLoads
+from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.forces import ROUNDOFF, body_force, facet_areas
 from dpl.fem.loads.sampling import Array
-from dpl.fem.loads.sized import rounded
-from dpl.fem.loads.surface import SurfaceLoads
+from dpl.fem.loads.sized import CombinedLoads, VectorLoads, rounded
 from dpl.fem.options import option
 from dpl.fem.problem import Problem
 from dpl.system.checks import named_errors

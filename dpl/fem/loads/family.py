@@ -1,4 +1,4 @@
-"""Load families: the interface that the package needs, and a base class for new ones."""
+"""Load families: the interface that the package needs, and base classes for new ones."""
 
 import math
 from abc import abstractmethod
@@ -9,15 +9,18 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.identity import identity_of
+from dpl.fem.identity import identity_of, plain
 from dpl.fem.loads.sampling import SAMPLINGS, Array
+from dpl.fem.mesh.regions import Region, facets_in
 from dpl.fem.options import check_options
 from dpl.fem.problem import Problem
 from dpl.fem.ranges import ParameterRange, Young
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
+from dpl.system.checks import named_errors
 
 MAX_DISTANCE = 1e-3  # distance from a family up to which a force counts as a load of it [-]
 
@@ -248,3 +251,41 @@ class RandomLoads(LoadFamily):
 
     def skipped_work(self) -> list[str]:
         return []
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceLoads(RandomLoads):
+    """Base of load families that act on facets of the boundary.
+
+    Attributes:
+        region: Part of the boundary, see `dpl.fem.mesh.facets_in`; None for all of it.
+    """
+
+    _: KW_ONLY
+    region: Region | None = None
+
+    @cached_property
+    def facets(self) -> NDArray[np.int_]:
+        """Numbers of the boundary facets on which these loads act, (E,)."""
+        problem = self.problem
+        if self.region is None:
+            return np.asarray(problem.mesh.boundary_facets())
+        with named_errors("region = "):
+            return facets_in(self.region, problem.mesh, problem.length, problem.origin)
+
+    @cached_property
+    def loadable_dofs(self) -> Tensor:
+        """Free degrees of freedom of the nodes of `facets`, (N, D), boolean."""
+        nodes = torch.zeros(self.problem.shape[0], dtype=torch.bool)
+        nodes[self.problem.basis.get_dofs(self.facets).all()] = True
+        loadable = nodes[:, None] & self.problem.free
+        if not loadable.any():
+            words = "the boundary" if self.region is None else f"region = {self.region}"
+            raise ValueError(f"{words} is fixed everywhere; loads must act on a free node")
+        return loadable
+
+    def identity(self) -> dict[str, Any]:
+        """Return the options; a region is identified by the facets that it selects."""
+        options = super().identity()
+        del options["region"]
+        return options if self.region is None else options | {"region": plain(self.facets)}

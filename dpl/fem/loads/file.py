@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.identity import plain
-from dpl.fem.loads.combined import CombinedLoads
 from dpl.fem.loads.fit import best_fit
 from dpl.fem.loads.sampling import Array
+from dpl.fem.loads.sized import CombinedLoads
 from dpl.fem.options import option
 from dpl.system.files import read_array
 

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.fit import amplitudes, fit
 from dpl.fem.loads.modal_basis import Modes, eigenmodes
 from dpl.fem.loads.sampling import Array, Quantile, constant, symmetric_uniform, uniform01
 from dpl.fem.loads.sized import MIN_DEFLECTION
-from dpl.fem.loads.surface import SurfaceLoads
 from dpl.fem.options import option
 
 TESTED = np.linspace(0.0, 1 - 2.0**-53, 1001)  # numbers at which distributions are examined

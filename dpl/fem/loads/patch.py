@@ -12,10 +12,10 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
+from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.forces import ROUNDOFF, facet_areas
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import SizedLoads, largest_deflection, softest_node
-from dpl.fem.loads.surface import SurfaceLoads
 from dpl.fem.options import option
 
 MAX_ROUNDS = 5  # of decisions about loaded facets; a disc away from supports needs one or two

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import SizedLoads, largest_deflection, point_forces, softest_node
-from dpl.fem.loads.surface import SurfaceLoads
 from dpl.fem.options import option
 
 
