@@ -8,7 +8,7 @@ import skfem
 import torch
 from laws import LAWS
 from skfem.io.meshio import to_meshio
-from solving import assert_derivatives, load_of, rest, uncompiled
+from solving import assert_derivatives, load_of, uncompiled
 
 from dpl import fem
 from dpl.fem.postprocess import RestStiffness
@@ -40,12 +40,6 @@ def body(core, other, mesh=None, **options):
 def displacement(problem, size=0.01):
     random = torch.Generator().manual_seed(0)
     return size * torch.randn(1, *problem.shape, generator=random, dtype=torch.float64)
-
-
-def end_load(problem, size=2e-4):
-    force = rest(problem)
-    force[:, problem.points[:, 0] > 0.99, 2] = -size
-    return load_of(force)
 
 
 FIBRE_LAWS = {
