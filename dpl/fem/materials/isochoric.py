@@ -71,7 +71,7 @@ class PolynomialMaterial(InvariantBasedMaterial):
     2 (c10 + c01). The volumetric term is that of Abaqus (D1 = 2/bulk).
     """
 
-    shear_name: ClassVar[str]  # of the shear modulus at rest, in a message
+    shear_name: ClassVar[str] = "2 (c10 + c01)"  # of the shear modulus at rest, in a message
 
     def check_constants(self) -> None:
         """Check that the body resists shear and compression."""
@@ -105,7 +105,6 @@ class MooneyRivlinK2(BulkOrPoisson, PolynomialMaterial):
 
     ranged: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk", "poisson")
     dimensional: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk")
-    shear_name: ClassVar[str] = "2 (c10 + c01)"
 
     c10: Constant
     c01: Constant
