@@ -101,20 +101,6 @@ def test_a_batch_is_its_members_each_a_body_of_its_own(make_scene):
         assert torch.allclose(product, one.tangent_product(alone, alone)[0], rtol=1e-9, atol=1e-15)
 
 
-def test_a_law_that_is_its_energy_alone_has_batches_too(make_scene):
-    class Slow(fem.NeoHookeanLn):
-        response = fem.Material.response
-        stress = fem.Material.stress
-        tangent = fem.Material.tangent
-
-    slow, fast = (make_scene(law=law, poisson=SPAN) for law in (Slow, fem.NeoHookeanLn))
-    load = fast.loads.sample((0, 0), range(3))
-    u = fem.solve(fast.solver, load).displacement
-    found = slow.problem.with_parameters(load.parameters).internal_force(u)
-    expected = fast.problem.with_parameters(load.parameters).internal_force(u)
-    assert torch.allclose(found, expected, rtol=1e-9, atol=1e-15)
-
-
 def test_nothing_is_compiled_or_analysed_again(wide, monkeypatch):
     loads = wide.loads.sample((0, 0), range(6))
     fem.solve(wide.solver, fem.Load(*(column[:1] for column in loads)))
@@ -199,17 +185,6 @@ def test_a_scene_of_one_refuses_to_predict_for_another(scene, few):
         ValueError, match=r"Load.parameters has 1 columns; the body has ranges of \[\]"
     ):
         Surrogate(FCNN(scene, width=4), MSE(), scene).predict(few.load)
-
-
-def test_gradients_of_exact_answers_are_those_of_the_body_of_each_load(wide, few, make_scene):
-    force = few.force.clone().requires_grad_()
-    fem.DifferentiableSolve(wide.solver)(
-        fem.Load(force, few.young, few.parameters)
-    ).square().sum().backward()
-    one = make_scene(poisson=float(few.parameters[1]))
-    alone = few.force[1:2].clone().requires_grad_()
-    fem.DifferentiableSolve(one.solver)(fem.Load(alone, few.young[1:2])).square().sum().backward()
-    assert torch.allclose(force.grad[1], alone.grad[0], rtol=1e-6, atol=1e-12)
 
 
 def test_exact_answers_are_differentiable_in_the_parameters(wide, few):
@@ -384,7 +359,7 @@ def test_every_network_hears_poissons_ratio_and_a_batch_is_its_members(build, wi
 
 
 def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, few):
-    net = Unrolled(wide, rank=90, cells=8, stages=1, symmetry=False)
+    net = Unrolled(wide, rank=60, cells=16, stages=1)
     net.fit(sets.samples("train"), sets.samples("val"))
     module = Surrogate(net, MSE(), wide).eval()
     light = few._replace(force=1e-4 * few.force)
