@@ -46,8 +46,7 @@ if TYPE_CHECKING:
     from dpl.fem.materials.ogden import OgdenK2
     from dpl.fem.materials.parameters import CellField
     from dpl.fem.materials.volumetric import VolumetricK2, VolumetricK4
-    from dpl.fem.mesh.finger_mesh import finger
-    from dpl.fem.mesh.generators import box, rectangle
+    from dpl.fem.mesh.generators import box, finger, rectangle
     from dpl.fem.mesh.propeller_mesh import propeller
     from dpl.fem.mesh.reading import read_cell_data, read_mesh
     from dpl.fem.mesh.regions import Box, Cylinder, Plane, Sphere, Tag

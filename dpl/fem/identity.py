@@ -11,14 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-OPTIONAL = {"optional": True}  # metadata of a field that `identity_of` leaves out at its default
-
 
 def identity_of(value: object, *, exclude: Collection[str] = ()) -> dict[str, Any]:
     """Return the class name and the options of an object as plain data.
 
-    The options are the fields of a dataclass, without `OPTIONAL` ones that have their default, or
-    the attributes of any other object.
+    The options are the fields of a dataclass, or the attributes of any other object. A field with
+    the metadata `optional` is left out where it has its default.
 
     Args:
         value: The object.
@@ -32,7 +30,7 @@ def identity_of(value: object, *, exclude: Collection[str] = ()) -> dict[str, An
         names = [
             field.name
             for field in fields(value)
-            if not (field.metadata == OPTIONAL and getattr(value, field.name) is field.default)
+            if not (field.metadata.get("optional") and getattr(value, field.name) is field.default)
         ]
     options = {name: plain(getattr(value, name)) for name in names if name not in exclude}
     for name, option in options.items():

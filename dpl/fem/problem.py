@@ -514,9 +514,6 @@ class Problem:
                 B > 1 each member of a batch has its own: such a problem has energies, forces and
                 residuals, but no tangent. It is differentiable in parameters that require a
                 gradient.
-
-        Raises:
-            ValueError: The problem has another number of ranges, or the law does not allow a value.
         """
         ranges = self.parameter_ranges
         if parameters.shape[-1] != len(ranges):

@@ -41,11 +41,7 @@ class ParameterRange(tuple[float, float]):
 
     @classmethod
     def of(cls, name: str, value: Any) -> "ParameterRange":
-        """Return the range of [low, high] or of {low, high, distribution}.
-
-        Raises:
-            ValueError: `value` is neither, or is out of order. The message begins with `name`.
-        """
+        """Return the range of [low, high] or of {low, high, distribution}."""
         ends, distribution = _parts(name, value)
         if len(ends) != 2 or not ends[0] < ends[1]:
             raise ValueError(
@@ -60,9 +56,6 @@ class ParameterRange(tuple[float, float]):
     def of_young(cls, young: Young) -> "ParameterRange":
         """Return the range of Young's moduli [Pa]: a number, [low, high], low = high allowed, or
         {low, high, distribution}.
-
-        Raises:
-            ValueError: `young` is none of these, or not above 0.
         """
         ends, distribution = _parts("young", young)
         if len(ends) != 2 or not 0 < ends[0] <= ends[1]:
@@ -100,9 +93,6 @@ def _parts(name: str, value: Any) -> tuple[list[float], str]:
     """Return the ends of a number, [low, high] or {low, high, distribution}, and the distribution.
 
     There are no ends if the value is none of these, or has an end that is not finite.
-
-    Raises:
-        ValueError: There is no such distribution. The message begins with `name`.
     """
     options = dict(value) if isinstance(value, Mapping) else {}
     ends = [options.pop("low", None), options.pop("high", None)] if options else value

@@ -34,9 +34,6 @@ class Units(NamedTuple):
         Args:
             value: Stresses, of any shape.
             words: The option and its value, for the message of an error.
-
-        Raises:
-            ValueError: The loads have a range of moduli.
         """
         return value / self._one_modulus(words)
 
@@ -64,11 +61,7 @@ class Units(NamedTuple):
 
 
 def check_young(young: float | None) -> None:
-    """Check a modulus of `Units`.
-
-    Raises:
-        ValueError: The modulus is not a positive number.
-    """
+    """Check a modulus of `Units`."""
     if young is not None and not 0 < young < math.inf:
         raise ValueError(f"young = {young} must be a number above 0 [Pa]")
 
@@ -81,9 +74,6 @@ def vector(name: str, value: Sequence[float], dim: int, unit: str) -> NDArray[np
         value: The components.
         dim: D.
         unit: Unit of the components, for the message of an error.
-
-    Raises:
-        ValueError: The components are not D finite numbers.
     """
     if len(value) != dim or not np.isfinite(value).all():
         raise ValueError(

@@ -16,7 +16,7 @@ from dpl.fem.mesh import check_mesh
 
 NH, EPS = fem.NeoHookeanLn(0.3), np.finfo(float).eps
 CELLS = 3  # along the sides of the grids
-DISTANCES = [1e3, 1e6]
+DISTANCES = [1e6]
 
 
 def away(mesh: skfem.Mesh, distance: float) -> skfem.Mesh:
@@ -107,44 +107,6 @@ def test_regions_in_absolute_coordinates_hold_the_same_nodes(distance):
         ]
         assert held[0].any()
         assert torch.equal(*held)
-
-
-def test_a_cylinder_selects_a_far_bore(distance):
-    mesh = away(fem.propeller(), distance)
-    centre = distance * np.array([1.0, -0.7, 0.9])
-    problem = fem.Problem.build(mesh, NH, fixed=fem.Cylinder(0, 0.05, centre))
-    assert (~problem.free).sum() == 525
-
-
-def test_modes_of_a_far_body_are_those_of_a_near_one(distance):
-    found = []
-    for d in (0.0, distance):
-        mesh = away(fem.box([4.0, 1.1, 1.0], [9, 3, 3]), 4 * d)
-        found.append(
-            fem.eigenmodes(
-                fem.LinearSolver(fem.Problem.build(mesh, NH, fixed=fem.Plane(0, "min"))), 4
-            )
-        )
-    near, far = found
-    allowed = tolerance(distance, 8)
-    assert far.values.numpy() == pytest.approx(near.values.numpy(), rel=allowed)
-    # a vector turns by the error over the gap between eigenvalues
-    gap = float((near.values.diff() / near.values[1:]).min())
-    assert_close(far.vectors, near.vectors, rtol=0.0, atol=allowed / gap)
-
-
-def test_a_far_beam_bends_as_a_near_one(distance):
-    """The traction on its end raised an error of Newton's method inside scikit-fem."""
-    answers = []
-    for d in (0.0, distance):
-        mesh = away(fem.box([100.0, 25.0, 25.0], [9, 3, 3]), 100 * d)
-        problem = fem.Problem.build(mesh, NH, fixed=fem.Plane(0, "min"))
-        force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
-        answer = fem.solve(fem.Newton(problem, tol=1e-10), fem.Load(force[None], torch.ones(1)))
-        assert answer.converged.all()
-        answers.append(answer.displacement)
-    near, far = answers
-    assert_close(far, near, rtol=0.0, atol=1e-8 + 10 * tolerance(distance, 8))
 
 
 def test_a_body_a_thousand_lengths_away_keeps_its_symmetries():

@@ -198,11 +198,6 @@ def test_angle_through_a_cylinder_follows_the_logarithm_of_the_radius(cell):
     assert fine[1] < 0.05
 
 
-def test_quadratic_elements_follow_it_more_closely():
-    linear, quadratic = (errors(quarter_cylinder(4, "tetra"), degree) for degree in (1, 2))
-    assert quadratic[0] < 0.5 * linear[0]
-
-
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
 def test_directions_are_of_first_order_on_linear_meshes_and_of_second_on_curved_ones(cell):
     coarse, fine = (np.array(errors(quarter_cylinder(count, cell))) for count in (2, 4))
@@ -242,7 +237,7 @@ def test_surfaces_may_be_regions_in_metres():
         (lambda: fem.ConstantFibres([1.0, 0, 0], [0, 0, 0]), "sheet must be finite and not zero"),
         (lambda: fem.ConstantFibres([1.0, 1, 0], [2, 2, 0]), "sheet must not be parallel to fibre"),
         (lambda: wall(longitudinal=[0, 0, 0]), "longitudinal must be finite and not zero"),
-        (lambda: wall(inner_angle=math.nan), "inner_angle = nan must be a finite number"),
+        (lambda: wall(inner_angle=math.nan), "inner_angle = nan must be a number"),
         (lambda: fem.FibreData("fibres"), "fibre must be the name of cell data if there is a file"),
         (lambda: fem.FibreData("f", [[1.0, 0]], "a.vtu"), "sheet must be the name of cell data"),
     ],

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from itertools import product
 
 import pytest
 import torch
@@ -10,8 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from dpl import fem
-from dpl.fem.materials.fibres.energies import COMPONENTS
-from dpl.fem.materials.tensors import green_lagrange, volume_change
+from dpl.fem.materials.tensors import volume_change
 
 FIBRES = {
     "guccione": fem.Guccione(0.4, 8.0, 2.0, 4.0),
@@ -86,28 +84,6 @@ def assert_near(found: Tensor, wanted: Tensor, tolerance: float) -> None:
 # ------------------------------------------------------------------ derivatives
 
 
-def test_strain_derivatives_are_those_of_the_energy(fibres, gradients):
-    """S = 2 dW/de and dS/dE = 4 d2W/de2, in the order of `COMPONENTS`."""
-    strains = (2 * green_lagrange(gradients)).reshape(-1, 3, 3)
-
-    def energy(e: Tensor) -> Tensor:
-        return fibres.energy((e + e.mT) / 2)
-
-    slope = torch.func.vmap(torch.func.grad(energy))(strains)
-    curvature = torch.func.vmap(torch.func.hessian(energy))(strains)
-    e = tuple(strains[:, i, j] for i, j in COMPONENTS)
-    S, D = fibres.strain_derivatives(fibres.constants, e)
-    assert (len(S), len(D)) == (6, 21)
-    for found, (i, j) in zip(S, COMPONENTS, strict=True):
-        wanted = 2 * slope[:, i, j]
-        assert_close(found + 0 * wanted, wanted, rtol=1e-12, atol=1e-12 * slope.abs().max().item())
-    size = curvature.abs().max().item()
-    pairs = [(v, w) for v in range(6) for w in range(v, 6)]
-    for found, (v, w) in zip(D, pairs, strict=True):
-        wanted = 4 * curvature[:, *COMPONENTS[v], *COMPONENTS[w]]
-        assert_close(found + 0 * wanted, wanted, rtol=1e-10, atol=1e-10 * size)
-
-
 # ------------------------------------------------------------------ invariance
 
 
@@ -119,17 +95,6 @@ def test_rotating_fibres_and_body_rotates_the_stress(law, gradients, generator):
     assert_near(twin.stress(turned), R @ law.stress(gradients) @ R.mT, 1e-12)
     A = torch.einsum("ia,Jb,kc,Ld,...abcd->...iJkL", R, R, R, R, law.tangent(gradients))
     assert_near(twin.tangent(turned), A, 1e-12)
-
-
-def test_law_is_anisotropic(law, gradients, generator):
-    twin = fem.FibreReinforced(law.matrix, law.fibres, rotations(5, generator))
-    assert (twin.energy(gradients) - law.energy(gradients)).abs().max() > 1e-3
-
-
-def test_directions_may_be_reversed(law, gradients):
-    """Fibres and sheets have no sense of direction: f, s to -f, -s."""
-    twin = fem.FibreReinforced(law.matrix, law.fibres, law.frames * torch.tensor([-1.0, -1.0, 1.0]))
-    assert_close(twin.energy(gradients), law.energy(gradients), rtol=1e-13, atol=1e-15)
 
 
 def test_each_cell_has_its_own_frame(law, gradients):
@@ -157,30 +122,6 @@ def moduli_at_rest(fibres: fem.FibreEnergy) -> Tensor:
     zero = torch.zeros(3, 3, dtype=torch.float64)
     law = fem.FibreReinforced(matrix, fibres, EYE[None])
     return law.response(zero).moduli - matrix.response(zero).moduli
-
-
-def test_moduli_at_rest_are_those_of_the_linearised_energy():
-    """Hooke's limit: second derivatives of the quadratic part of each energy, by hand."""
-    wanted = torch.zeros(3, 3, 3, 3, dtype=torch.float64)
-    c, b = 0.4, {0: 8.0, 1: 2.0, 2: 2.0}
-    for i, j in product(range(3), range(3)):
-        if i == j:
-            wanted[i, i, i, i] = c * b[i]
-        else:
-            wanted[i, j, i, j] = wanted[i, j, j, i] = c / 2 * (2.0 if 0 not in (i, j) else 4.0)
-    assert_close(moduli_at_rest(FIBRES["guccione"]), wanted)
-    wanted = torch.zeros(3, 3, 3, 3, dtype=torch.float64)
-    wanted[0, 0, 0, 0], wanted[1, 1, 1, 1] = 4 * 0.5, 4 * 0.3
-    for i, j, k, m in product((0, 1), repeat=4):
-        if i != j and k != m:
-            wanted[i, j, k, m] = 0.2
-    assert_close(moduli_at_rest(FIBRES["holzapfel_ogden"]), wanted)
-    wanted = torch.zeros(3, 3, 3, 3, dtype=torch.float64)
-    for sign in (1, -1):
-        a = torch.tensor([math.cos(0.6), sign * math.sin(0.6), 0.0], dtype=torch.float64)
-        M = 0.1 * EYE + 0.7 * torch.outer(a, a)
-        wanted += 4 * 0.5 * torch.einsum("ij,kl->ijkl", M, M)
-    assert_close(moduli_at_rest(FIBRES["two_families"]), wanted)
 
 
 @pytest.mark.parametrize("size", [1e-6, 1e-10, 1e-14])
@@ -320,17 +261,6 @@ def test_families_have_the_closed_forms():
         assert second_stress(one, frame, shear(-SHEAR)) == [0, 0, 0, 0]
 
 
-def test_two_equal_families_are_twice_one(gradients, frames):
-    """At an angle of 0 there is one direction; `families` says how often it counts."""
-    one, two = (
-        fem.FibreReinforced(
-            fem.VolumetricK2(1.0), fem.HolzapfelGasserOgdenFibres(k1, 2.0, 0.1, 0.0, n), frames
-        )
-        for k1, n in ((1.0, 1), (0.5, 2))
-    )
-    assert_near(one.stress(gradients), two.stress(gradients), 1e-14)
-
-
 def test_holzapfel_ogden_has_the_closed_forms():
     """S = 2 a <x> exp(b <x>^2) of fibres and sheets; S12 = afs C12 exp(bfs C12^2), (2009)."""
     fibres = fem.HolzapfelOgdenFibres(0.5, 2.0, 0.3, 3.0, 0.2, 1.5)
@@ -388,14 +318,6 @@ def test_demiray_has_the_closed_forms():
     wanted = 0.3 * SHEAR * math.exp(2.0 * SHEAR**2)
     assert sigma[0, 1].item() == pytest.approx(wanted, rel=1e-12)
     assert (law.mu, law.lam) == (pytest.approx(0.3), pytest.approx(5.0 - 0.2))
-
-
-def test_small_exponent_of_demiray_is_the_neo_hookean_solid(gradients):
-    limit = fem.NeoHookeanIsoK2(0.3)
-    law = fem.DemirayK2(limit.mu, 1e-12, limit.bulk)
-    assert_near(law.energy(gradients), limit.energy(gradients), 1e-10)
-    assert_near(law.stress(gradients), limit.stress(gradients), 1e-10)
-    assert_near(law.tangent(gradients), limit.tangent(gradients), 1e-10)
 
 
 @pytest.mark.parametrize(
@@ -465,29 +387,23 @@ def test_law_needs_its_directions(fibres, gradients):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: fem.Guccione(0.0, 1, 1, 1), "c = 0.0 must be above 0"),
-        (lambda: fem.Guccione(1, 1, -1, 1), "bt = -1 must be above 0"),
-        (lambda: fem.Guccione(1, 1, 1, math.nan), "bfs = nan must be above 0"),
-        (lambda: fem.HolzapfelGasserOgdenFibres(0, 1), "k1 = 0 must be above 0"),
-        (lambda: fem.HolzapfelGasserOgdenFibres(1, math.inf), "k2 = inf must be above 0"),
-        (
-            lambda: fem.HolzapfelGasserOgdenFibres(1, 1, 0.34),
-            "kappa = 0.34 must lie between 0 and 1/3",
-        ),
-        (
-            lambda: fem.HolzapfelGasserOgdenFibres(1, 1, -0.1),
-            "kappa = -0.1 must lie between 0 and 1/3",
-        ),
-        (lambda: fem.HolzapfelGasserOgdenFibres(1, 1, 0, math.nan), "angle = nan must be a finite"),
+        (lambda: fem.Guccione(0.0, 1, 1, 1), "c = 0.0 must be a number above 0"),
+        (lambda: fem.Guccione(1, 1, -1, 1), "bt = -1 must be a number above 0"),
+        (lambda: fem.Guccione(1, 1, 1, math.nan), "bfs = nan must be a number above 0"),
+        (lambda: fem.HolzapfelGasserOgdenFibres(0, 1), "k1 = 0 must be a number above 0"),
+        (lambda: fem.HolzapfelGasserOgdenFibres(1, math.inf), "k2 = inf must be a number above 0"),
+        (lambda: fem.HolzapfelGasserOgdenFibres(1, 1, 0.34), "kappa = 0.34 must be a number"),
+        (lambda: fem.HolzapfelGasserOgdenFibres(1, 1, -0.1), "from 0 to 0.333333"),
+        (lambda: fem.HolzapfelGasserOgdenFibres(1, 1, 0, math.nan), "angle = nan must be a number"),
         (lambda: fem.HolzapfelGasserOgdenFibres(1, 1, 0, 0, 3), "families = 3 must be 1 or 2"),
-        (lambda: fem.HolzapfelOgdenFibres(0, 1, 1, 1, 1, 1), "af = 0 must be above 0"),
-        (lambda: fem.HolzapfelOgdenFibres(1, 1, -1, 1, 1, 1), "as_ = -1 must be at least 0"),
-        (lambda: fem.HolzapfelOgdenFibres(1, 1, 0, 1, 0, 0), "bfs = 0 must be above 0"),
+        (lambda: fem.HolzapfelOgdenFibres(0, 1, 1, 1, 1, 1), "af = 0 must be a number above 0"),
+        (lambda: fem.HolzapfelOgdenFibres(1, 1, -1, 1, 1, 1), "as_ = -1 must be a number from 0"),
+        (lambda: fem.HolzapfelOgdenFibres(1, 1, 0, 1, 0, 0), "bfs = 0 must be a number above 0"),
         (lambda: fem.DemirayK2(0, 1, 1), "a = 0 must be above 0"),
-        (lambda: fem.DemirayK2(1, 0, 1), "b = 0 must be above 0"),
+        (lambda: fem.DemirayK2(1, 0, 1), "b = 0 must be a number above 0"),
         (lambda: fem.DemirayK2(1, 1, 0), "bulk = 0 must be above 0"),
-        (lambda: fem.VolumetricK2(0), "bulk = 0 must be above 0"),
-        (lambda: fem.VolumetricK4(math.inf), "bulk = inf must be above 0"),
+        (lambda: fem.VolumetricK2(0), "bulk = 0 must be a number above 0"),
+        (lambda: fem.VolumetricK4(math.inf), "bulk = inf must be a number above 0"),
         (lambda: reinforced(matrix=fem.LinearElastic(0.3)), "matrix = LinearElastic must be"),
         (lambda: reinforced(directions=torch.eye(3)), "must have .cells, 3, 3."),
         (

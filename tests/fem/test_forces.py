@@ -54,31 +54,6 @@ def test_linear_traction_adds_up_to_its_integral(body):
     assert not force[1:].any()
 
 
-def test_pressure_all_around_is_in_balance(body):
-    """Sum of n dA = 0 over a closed surface, each face in its own direction."""
-    dim, side = body.shape[1], 1 / body.length
-    total = torch.zeros(body.shape, dtype=torch.float64)
-    for axis in range(dim):
-        for end, sign in (("min", -1.0), ("max", 1.0)):
-            total += traction(body, fem.Plane(axis, end), constant(sign * np.eye(dim)[axis]))
-    assert total.sum(dim=0).abs().max() < 1e-13
-    volume = side**dim
-    expected = volume * torch.eye(dim, dtype=torch.float64)
-    assert_close(moments(body, total), expected, rtol=1e-12, atol=1e-14)
-    assert total[~body.boundary].abs().sum() < 1e-14
-
-
-def test_weight_acts_at_the_centre_of_gravity(kind, grid):
-    """Exact where the quadrature integrates x N: all elements but the triangles of degree 1."""
-    cell, degree = kind
-    problem = fem.Problem.build(grid(cell, 3), fem.NeoHookeanLn(0.3), degree=degree, length=1.0)
-    dim = problem.shape[1]
-    density = np.arange(1.0, dim + 1)
-    expected = torch.from_numpy(np.outer(np.full(dim, 0.5), density))
-    force = body_force(problem, constant(density))
-    assert_close(moments(problem, force), expected, rtol=1e-12, atol=1e-14)
-
-
 def test_body_force_is_evaluated_where_it_acts(kind, grid):
     """The total of the density (x, 0, 0) over a unit body is 1/2."""
     cell, degree = kind
@@ -90,17 +65,6 @@ def test_body_force_is_evaluated_where_it_acts(kind, grid):
     force = body_force(problem, density).sum(dim=0)
     assert force[0].item() == pytest.approx(0.5, rel=1e-12)
     assert not force[1:].any()
-
-
-def test_region_of_a_traction_without_a_facet_is_an_error(body):
-    corner = body.mesh.p.sum(axis=0).argmin()
-    for region in (
-        fem.Plane(0, 0.4321 / body.length),
-        lambda points: np.zeros(len(points), bool),
-        lambda points: np.arange(len(points)) == corner,
-    ):
-        with pytest.raises(ValueError, match="no facet of the boundary"):
-            traction(body, region, constant(np.ones(body.shape[1])))
 
 
 @pytest.fixture

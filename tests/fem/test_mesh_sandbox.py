@@ -321,12 +321,6 @@ def test_files_of_more_than_four_gigabytes_are_refused(tmp_path):
     refused(path, "GiB")
 
 
-def test_a_link_to_a_good_file_is_read(tmp_path):
-    cube(tmp_path)
-    (tmp_path / "link.vtu").symlink_to(tmp_path / "cube.vtu")
-    assert read_mesh(tmp_path / "link.vtu").t.shape[0] == 4
-
-
 @IN_PROCESS
 def test_a_path_from_the_working_folder_is_found(tmp_path, monkeypatch):
     cube(tmp_path)

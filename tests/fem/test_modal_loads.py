@@ -107,23 +107,6 @@ def test_neighbouring_eigenvalues_are_one_family():
     assert 1e-3 < float(modes.values[1] / modes.values[0] - 1) < 0.05
 
 
-def test_small_loads_along_a_mode_move_the_body_along_it(beam):
-    """F = q phi_k gives q phi_k / lambda_k, but for a deviation that is linear in q."""
-    problem = beam(fem.NeoHookeanLn(0.3))
-    newton = fem.Newton(problem, tol=1e-10, linear="superlu")
-    modes = fem.eigenmodes(newton.linear_solver, 3)
-    for k, value in enumerate(modes.values):
-        deviations = []
-        for size in (1e-4, 1e-5):
-            q = size * float(value)
-            load = fem.Load(q * modes.vectors[None, ..., k], torch.ones(1))
-            expected = q * modes.vectors[..., k] / value
-            answer = fem.solve(newton, load).displacement[0]
-            deviations.append(float((answer - expected).norm() / expected.norm()))
-        assert deviations[0] < 1e-3
-        assert deviations[1] < 0.2 * deviations[0]
-
-
 @pytest.mark.parametrize("deflection", [0.1, 0.4, 1.0])
 def test_the_softest_mode_at_its_largest_reaches_the_deflection(linear, deflection):
     loads = fem.ModalLoads(linear, n_modes=3, deflection=deflection)
@@ -141,29 +124,6 @@ def test_a_pickled_copy_has_the_same_loads(linear, sampling):
     assert torch.equal(found.force, expected.force)
     assert torch.equal(found.young, expected.young)
     assert "factor" not in copy.linear.__dict__
-
-
-def test_streams_indices_and_samplings_give_different_loads(linear):
-    kinds = [fem.ModalLoads(linear, n_modes=5, sampling=name) for name in SAMPLINGS]
-    streams = [(kind, seed) for kind in kinds for seed in ((0, 0), (0, 1), (1, 0))]
-    drawn = torch.cat([kind.sample(seed, range(5)).force for kind, seed in streams])
-    distance = torch.cdist(drawn.flatten(1), drawn.flatten(1))
-    distance.fill_diagonal_(1.0)
-    assert distance.min() > 1e-9
-
-
-def test_samples_are_the_loads_of_points(linear, sampling):
-    loads = fem.ModalLoads(linear, n_modes=3, sampling=sampling, young=[1.0, 2.0])
-    points = loads.points((3, 0), [2, 5])
-    assert points.shape == (2, loads.n_random)
-    assert points.dtype == torch.float64
-    assert loads.n_random == len(loads.eigenmodes.values) + 4
-    direct = SAMPLINGS[sampling]((3, 0), 5, loads.n_random)
-    assert np.array_equal(points[1].numpy(), direct)
-    at, sample = loads.loads_at(points), loads.sample((3, 0), [2, 5])
-    assert torch.equal(at.force, sample.force)
-    assert torch.equal(at.young, sample.young)
-    assert torch.equal(at.young, loads.young_at(points))
 
 
 def point_of(loads, *q, centre=0.0, radius=0.0, amplitude=0.0, young=0.0):
@@ -242,15 +202,6 @@ def test_the_loaded_area_has_the_radius_of_the_patch(linear, radius):
     assert sizes == [1] * 20 if radius == 0 else max(sizes) > 1
 
 
-@pytest.mark.parametrize("share", [1.0, 0.5])
-def test_other_distributions_can_be_plugged_in(linear, share):
-    draw = partial(np.full_like, fill_value=share)
-    loads = fem.ModalLoads(linear, n_modes=3, patch_radius=(2.0, 2.0), distribution=draw)
-    force = loads.eigenmodes.vectors @ (share * loads.q_max)
-    expected = torch.where(loads.loadable_dofs, force, 0.0)
-    assert_close(loads.sample((0, 0), [0]).force[0], expected, rtol=1e-12, atol=0)
-
-
 @pytest.mark.parametrize("distribution", ["uniform", "log"])
 @pytest.mark.parametrize("ends", [[1e9, 2e11], [0.1, 0.3], [1e-3, 1e12], [5.0, 5.0]])
 def test_moduli_stay_in_their_range(linear, ends, distribution):
@@ -295,42 +246,6 @@ def test_the_exponent_decides_whether_energies_displacements_or_forces_are_equal
         assert (float(values.max() / values.min()) - 1 < 1e-8) == (kind == equal)
     assert float(pairs[0][1].norm(dim=1).max()) == pytest.approx(0.4, rel=1e-8)
     assert loads.largest_force == pytest.approx(float(sum(forces).norm()), rel=1e-10)
-
-
-def test_radius_makes_areas_small_down_to_one_node(linear):
-    points = linear.problem.points
-    places = points[linear.problem.boundary & linear.problem.free.any(dim=1)]
-    loads = fem.ModalLoads(
-        linear, n_modes=2, patch_radius=(0.0, 2.0), radius=logarithmic, distribution=constant
-    )
-    for t in (0.0, 0.3, 0.6, 0.9):
-        force = loads.loads_at(point_of(loads, centre=0.7, radius=t)).force[0]
-        middle = places[int(0.7 * len(places))]
-        reach = (points - middle).norm(dim=1) <= 2 * 1e-2 ** (1 - t)
-        inside = reach[:, None] & loads.loadable_dofs
-        assert torch.equal(force != 0, inside & (loads.eigenmodes.vectors @ loads.q_max != 0))
-
-
-def test_amplitude_is_one_factor_on_a_whole_load(linear):
-    plain, scaled = (
-        fem.ModalLoads(linear, n_modes=3, amplitude=a) for a in (constant, log_tail_mixture)
-    )
-    points = plain.points((0, 0), range(64))
-    factors = torch.from_numpy(log_tail_mixture(points[:, -2].numpy()))
-    expected = factors[:, None, None] * plain.loads_at(points).force
-    rounding = 1e-15 * float(plain.q_max.max())
-    assert torch.allclose(scaled.loads_at(points).force, expected, rtol=1e-12, atol=rounding)
-    assert 5 < int((factors < 1).sum()) < 30
-
-
-def test_what_always_acts_has_no_amplitude(linear):
-    weight = torch.full((linear.problem.shape), -1e-3, dtype=torch.float64)
-    none = fem.ModalLoads(linear, n_modes=2, amplitude=log_tail_mixture)
-    loads = fem.ModalLoads(linear, n_modes=2, amplitude=log_tail_mixture, constant_force=weight)
-    with_, without = (kind.sample(0, range(20)).force for kind in (loads, none))
-    assert torch.allclose(with_ - weight, without, rtol=0, atol=1e-16)
-    nothing = fem.ModalLoads(linear, n_modes=2, amplitude=np.zeros_like, constant_force=weight)
-    assert torch.equal(nothing.sample(0, [3]).force[0], weight)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from solving import load_of
 from torch import Tensor
 
 from benchmarks.verification.bodies import balanced, mean, slender
-from benchmarks.verification.refinement import COOK, FINER, OTHERS, SIDES, at, membrane
+from benchmarks.verification.refinement import FINER, OTHERS, SIDES, at, membrane
 from benchmarks.verification.rods import BENT, KINDS, LOCKED, SAME
 from benchmarks.verification.twisted import TWIST, twisted
 from dpl import fem
@@ -91,18 +91,6 @@ def test_beam_of_caribou_has_its_residuals_and_its_end():
     assert end_face(problem, answer.displacement) == pytest.approx([0, -21.0164, 76.1898], abs=1e-3)
 
 
-def test_beam_of_caribou_in_quadratic_elements_bends_twice_as_far():
-    """Caribou stops at a relative residual of 7e-4; its printed position is that state."""
-    problem, force = caribou(2)
-    *_, (_, state) = load_steps(problem, force)
-    printed = [0, -49.22035, 58.16711]
-    assert end_face(problem, state) == pytest.approx(printed, abs=1e-5)
-    assert problem.relative_residual(state, force[None]).item() == pytest.approx(7.4e-4, rel=0.02)
-    answer = fem.solve(fem.Newton(problem), load_of(force[None]))
-    assert answer.status.item() == fem.Status.CONVERGED
-    assert end_face(problem, answer.displacement) == pytest.approx(printed, abs=1e-3)
-
-
 COOK_OF = [  # law, degree, cells a side, u_y at (48, 52) [mm]
     *(
         (K4, d, n, text)
@@ -126,15 +114,6 @@ def test_membrane_of_cook_rises_as_tabulated(law, degree, count, printed):
     assert at(problem, u, (48, 52))[1] == digits(printed)
     if (law, degree, count) == (K4, 2, 8):
         assert at(problem, u, (48, 60)) == (digits("-13.8264"), digits("13.7505"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("degree", "level"), [(1, 4), (1, 5), (2, 3)])
-def test_membrane_of_cook_rises_as_printed_by_deal_ii(degree, level):
-    """Cook's membrane: the four digits of deal.II's code gallery, 0.5 % on the finest meshes."""
-    rise = at(*membrane(K4, SIDES[level], degree), (48, 52))[1]
-    assert f"{rise:.2f}" == COOK[degree].split()[level]
-    assert rise == pytest.approx(14.74, rel=0.02 if degree == 1 else 5e-3)
 
 
 # dolfinx tutorial, hyperelasticity: degree, n -> u of (20, 1, 1) [m], plain iterations
@@ -182,50 +161,6 @@ def test_column_follows_the_rotation_of_its_end(cells, degree):
     assert found[0] == pytest.approx(torque, rel=1e-9)
     assert found[1] == pytest.approx(axial, rel=2e-9)
     assert found[2] == pytest.approx(energy, rel=1e-10)
-
-
-# The paper's beam, rows of quadratic elements: cells, q -> u_z of the corner [m]
-BEAMS = {
-    ((8, 2), 5): -7.32678,
-    ((8, 2), 40): -49.67143,
-    ((16, 4), 5): -7.36089,
-    ((16, 4), 20): -28.3413,
-}
-
-
-def sag(beam, pull, corner, law: fem.Material, cells: tuple[int, int], q: float) -> float:
-    """Return u_z of the corner [m] of the paper's beam in hex27."""
-    problem = beam(law, *cells, degree=2)
-    answer = fem.solve(fem.Newton(problem, tol=1e-10), load_of(pull(problem, q)))
-    assert answer.status.item() == fem.Status.CONVERGED
-    return 100 * corner(problem, answer.displacement)[2].item()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("cells", "q"), BEAMS)
-def test_beam_of_quadratic_elements_bends_as_tabulated(beam, pull, corner, cells, q):
-    """The paper's beam; the other rows are in test_newton."""
-    assert sag(beam, pull, corner, SVK, cells, q) == pytest.approx(BEAMS[cells, q], abs=5.1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("q", "limit", "within"), [(20, -28.387, 0.02), (40, -49.955, 0.03)])
-def test_beams_of_quadratic_elements_tend_to_the_tabulated_limit(
-    beam, pull, corner, q, limit, within
-):
-    """The paper's beam: Richardson's limit of 4, 8 and 16 cells."""
-    a, b, c = (sag(beam, pull, corner, SVK, n, q) for n in ((4, 1), (8, 2), (16, 4)))
-    rate = (b - a) / (c - b)
-    assert rate > 2
-    assert c + (c - b) / (rate - 1) == pytest.approx(limit, abs=within / 10)
-
-
-@pytest.mark.slow
-def test_finest_beam_has_the_tabulated_eigenvalues(beam):
-    """The paper's beam: eigenvalues of K(0) in N/m at 12 000 degrees of freedom, to 1e-6."""
-    printed = [0.41357726] * 2 + [4.69213513] + [10.51183774] * 2 + [17.59484223]
-    values = fem.eigenmodes(fem.LinearSolver(beam(NH, 39, 9)), len(printed)).values[: len(printed)]
-    assert (4500 * 100 * values).tolist() == pytest.approx(printed, rel=1e-6)
 
 
 HEX, TET = list(KINDS)[:2]

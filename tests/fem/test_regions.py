@@ -72,12 +72,6 @@ def test_regions_tolerate_rounding_at_every_scale(scale):
     assert fem.Cylinder(0, side)(points).sum() == 12
 
 
-def test_cylinder_about_z_is_a_disc_in_2d():
-    points = fem.rectangle([2.0, 2.0], [3, 3]).p.T
-    assert fem.Cylinder(2, 1.0, [1, 1])(points).sum() == 5
-    assert np.array_equal(fem.Cylinder(2, 1.0, [1, 1])(points), fem.Sphere([1, 1], 1.0)(points))
-
-
 @pytest.mark.parametrize(
     ("build", "message"),
     [
@@ -186,74 +180,19 @@ def test_a_region_must_return_a_mask(answer):
         facets_in(answer, mesh)
 
 
-def test_bore_of_the_propeller_is_a_cylinder_and_a_tag():
-    mesh = fem.propeller()
-    for element in (skfem.ElementHex1(), skfem.ElementHex2()):
-        basis = skfem.Basis(mesh, element, intorder=1)
-        inside = nodes_in(fem.Cylinder(0, 0.05), basis)
-        assert np.array_equal(nodes_in(fem.Tag("bore"), basis), inside)
-    assert np.array_equal(facets_in(fem.Cylinder(0, 0.05), mesh), facets_in(fem.Tag("bore"), mesh))
-    assert len(facets_in(fem.Tag("bore"), mesh)) == 25 * 6
-
-
-GMSH_41 = """$MeshFormat
-4.1 0 8
-$EndMeshFormat
-$PhysicalNames
-3
-2 1 "held end"
-3 1 "body"
-3 2 "far cell"
-$EndPhysicalNames
-$Entities
-0 0 2 2
-1 0 0 0 0 1 1 1 1 0
-2 1 0 0 1 1 1 1 7 0
-1 0 0 0 1 1 1 1 1 0
-2 1 0 0 2 1 1 2 1 2 0
-$EndEntities
-$Nodes
-1 13 5 20
-3 1 0 13
-20
-5
-6
-7
-8
-9
-10
-11
-12
-13
-14
-15
-16
-9 9 9
-0 0 0
-1 0 0
-2 0 0
-0 1 0
-1 1 0
-2 1 0
-0 0 1
-1 0 1
-2 0 1
-0 1 1
-1 1 1
-2 1 1
-$EndNodes
-$Elements
-4 4 1 4
-2 1 3 1
-1 5 11 14 8
-2 2 3 1
-2 6 9 15 12
-3 1 5 1
-3 5 6 9 8 11 12 15 14
-3 2 5 1
-4 6 7 10 9 12 13 16 15
-$EndElements
-"""
+NODES = [20, *range(5, 17)]  # their numbers; the first one has no cell
+PLACES = ["9 9 9", *(f"{x} {y} {z}" for z in range(2) for y in range(2) for x in range(3))]
+GMSH_41 = "\n".join(
+    [
+        "$MeshFormat\n4.1 0 8\n$EndMeshFormat",
+        '$PhysicalNames\n3\n2 1 "held end"\n3 1 "body"\n3 2 "far cell"\n$EndPhysicalNames',
+        "$Entities\n0 0 2 2\n1 0 0 0 0 1 1 1 1 0\n2 1 0 0 1 1 1 1 7 0",
+        "1 0 0 0 1 1 1 1 1 0\n2 1 0 0 2 1 1 2 1 2 0\n$EndEntities",
+        *("$Nodes\n1 13 5 20\n3 1 0 13", *map(str, NODES), *PLACES, "$EndNodes"),
+        "$Elements\n4 4 1 4\n2 1 3 1\n1 5 11 14 8\n2 2 3 1\n2 6 9 15 12",
+        "3 1 5 1\n3 5 6 9 8 11 12 15 14\n3 2 5 1\n4 6 7 10 9 12 13 16 15\n$EndElements\n",
+    ]
+)
 
 
 def test_physical_groups_of_gmsh_are_tags_by_name_or_by_number(tmp_path):

@@ -45,11 +45,6 @@ def test_vectors_of_small_singular_values_are_orthogonal():
         assert_close(vectors.T @ vectors, torch.eye(8, dtype=torch.float64), rtol=0, atol=1e-13)
 
 
-def test_basis_of_single_precision_is_computed_in_double():
-    vectors, values = pod(noise(20, 50).float(), 4)
-    assert vectors.dtype == values.dtype == torch.float64
-
-
 @pytest.mark.parametrize("rank", [0, -1, 8])
 def test_rank_out_of_range_is_refused(rank):
     with pytest.raises(ValueError, match=f"rank = {rank} must lie between 1 and 7"):

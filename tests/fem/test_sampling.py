@@ -69,20 +69,6 @@ def test_quantiles_invert_the_distribution_that_is_claimed(name):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_draws_have_the_distribution_that_is_claimed(drawn, name):
-    """Kolmogorov, Smirnov: of 512 draws, less than 1 in 1000 by chance; normal: clipped at 3."""
-    quantile, cumulative, _, high = LAWS[name]
-    values = quantile(stream(drawn, 4, 512))[:, 1]
-    below = values[values < high]
-    share = len(below) / len(values)
-    expected = float(cumulative(np.nextafter(high, 0)))
-    assert share == pytest.approx(
-        expected, abs=3.3 * (expected * (1 - expected) / 512) ** 0.5 + 1e-2
-    )
-    assert stats.kstest(below, lambda x: cumulative(x) / expected).pvalue > 1e-3
-
-
-@pytest.mark.parametrize("name", LAWS)
 def test_quantiles_rise_and_stay_in_range(name):
     quantile, _, low, high = LAWS[name]
     values = quantile(np.array([0.0, 1e-300, *GRID, LAST]))
@@ -92,12 +78,8 @@ def test_quantiles_rise_and_stay_in_range(name):
     assert values[-1] <= high
 
 
-def test_one_is_one():
-    assert np.array_equal(constant(GRID), np.ones(len(GRID)))
-
-
 @pytest.mark.parametrize("name", [*LAWS, "one"])
-@pytest.mark.parametrize("shape", [(), (1,), (0,), (3, 4)])
+@pytest.mark.parametrize("shape", [(), (0,), (3, 4)])
 def test_quantiles_keep_the_shape(name, shape):
     quantile = LAWS[name][0] if name in LAWS else constant
     t = np.full(shape, 0.3)
@@ -159,17 +141,6 @@ def test_seeds_and_indices_give_different_points(drawn):
     assert len(np.unique(points)) == points.size  # no coordinate is that of another
 
 
-def test_coordinates_do_not_know_of_each_other(drawn):
-    points = stream(drawn, (0, 1), 512, 9)
-    assert np.abs(np.corrcoef(points.T) - np.eye(9)).max() < 0.15
-
-
-def test_streams_do_not_know_of_each_other():
-    """But for Sobol's, whose scramblings keep the first digit of point i or flip that of all."""
-    ours, theirs = (stream(independent, (0, name), 512) for name in (0, 1))
-    assert np.abs(np.corrcoef(ours.T, theirs.T)[:3, 3:]).max() < 0.15
-
-
 def test_points_of_one_stream_are_no_nearer_to_those_of_another_than_by_chance(drawn):
     """Validation asks for nothing that training has seen."""
     ours, theirs, chance = (
@@ -183,16 +154,10 @@ def test_points_of_one_stream_are_no_nearer_to_those_of_another_than_by_chance(d
 def test_no_point_is_drawn_with_a_warning(drawn):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for index in (*range(512), 1000, 12_345):
+        for index in (*range(64), 1000, 12_345, 2**20 + 1):
             point = drawn((0, 0), index, 9)
             assert point.dtype == np.float64
             assert ((point > 0) & (point < 1)).all()
-
-
-def test_points_far_out_in_the_stream_are_there(drawn):
-    point = drawn((0, 0), 2**20 + 1, 9)
-    assert point.shape == (9,)
-    assert not np.array_equal(point, drawn((0, 0), 2**20, 9))
 
 
 def test_random_access_to_a_sobol_sequence_equals_its_order():
@@ -200,33 +165,8 @@ def test_random_access_to_a_sobol_sequence_equals_its_order():
     assert np.array_equal(stream(sobol, (7, 2), 64, 5), engine.random(64))
 
 
-@pytest.mark.parametrize("size", [16, 64, 256])
+@pytest.mark.parametrize("size", [16, 64])
 def test_every_interval_holds_one_coordinate_of_a_sobol_sequence(size):
     """Sobol (1967): each coordinate is a (0, 1)-sequence in base 2, scrambled or not."""
     cells = np.sort(np.floor(stream(sobol, 2, size, 9) * size), axis=0)
     assert np.array_equal(cells, np.repeat(np.arange(size)[:, None], 9, axis=1))
-
-
-def test_independent_points_do_not_avoid_each_other():
-    cells = np.sort(np.floor(stream(independent, 2, 64, 9) * 64), axis=0)
-    assert all(len(np.unique(column)) < 55 for column in cells.T)  # 64 (1 - 1/e) = 40
-
-
-@pytest.mark.parametrize(("size", "count"), [(64, 2), (128, 5), (256, 9), (100, 9)])
-def test_sobol_points_fill_the_cube_more_evenly_than_independent_ones(size, count):
-    """By centred discrepancy, for each of five seeds."""
-    for seed in range(5):
-        even_, rough = (
-            qmc.discrepancy(stream(draw, seed, size, count)) for draw in (sobol, independent)
-        )
-        assert even_ < 0.5 * rough
-
-
-def test_sobol_means_are_closer_than_independent_ones():
-    """Owen (1998): the mean of a smooth function, here of a product."""
-
-    def error(draw, seed):
-        return abs(np.prod(1 + stream(draw, seed, 256, 5) - 0.5, axis=1).mean() - 1)
-
-    ours, theirs = (np.mean([error(d, s) for s in range(8)]) for d in (sobol, independent))
-    assert ours < 0.2 * theirs

@@ -9,7 +9,7 @@ import pytest
 import skfem
 import torch
 from laws import ISOTROPIC, LAWS
-from solving import load_of, sliding
+from solving import sliding
 from torch.testing import assert_close
 
 from dpl import fem
@@ -103,29 +103,6 @@ def test_energy_force_and_volume_ratio_are_those_of_the_image(body, bend):
         assert_close(problem.energy(symmetry.image(u)), problem.energy(u), rtol=1e-12, atol=0)
         assert_close(image.internal, symmetry.image(internal), rtol=0, atol=1e-13)
         assert_close(image.volume_ratio, volume, rtol=1e-12, atol=0)
-
-
-def test_all_signed_permutations_that_keep_the_cells_are_found():
-    """Counted another way: on the nodes' whole numbers, and without any mechanics."""
-    mesh = fem.box([3.0, 3.0, 3.0], [4, 4, 4], "tetra")
-    grid = {tuple(point): node for node, point in enumerate(mesh.p.T.round().astype(int))}
-    cells = {frozenset(cell) for cell in mesh.t.T.tolist()}
-    kept = set()
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1, -1), repeat=3):
-            Q = np.eye(3)[list(order)] * signs
-            moved = ((mesh.p.T - 1.5) @ Q.T + 1.5).round().astype(int)
-            node = [grid[tuple(point)] for point in moved]
-            if {frozenset(node[i] for i in cell) for cell in cells} == cells:
-                kept.add(tuple(Q.ravel()))
-    found = fem.symmetries(fem.Problem.build(mesh, NH))
-    assert {tuple(symmetry.rotation.flatten().tolist()) for symmetry in found} == kept
-
-
-def test_a_square_section_has_four_turns_and_four_mirrors(solver):
-    group = fem.symmetries(solver.problem)
-    assert sum(torch.det(symmetry.rotation) < 0 for symmetry in group) == 4
-    assert all((symmetry.rotation == symmetry.rotation.round()).all() for symmetry in group)
 
 
 @pytest.mark.parametrize("blades", [2, 3, 5])
@@ -326,38 +303,6 @@ def test_constant_forces_reduce_the_group_to_their_symmetries(solver):
         assert len(group) == order
         for symmetry, force in itertools.product(group, also):
             assert_close(symmetry.image(force), force, rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("mean", [False, True])
-def test_images_of_solutions_with_moved_supports_and_springs_are_solutions(mean):
-    supports = [
-        fem.DirichletBC(LEFT),
-        fem.DirichletBC(RIGHT, [0.1, None, None]),
-        fem.RobinBC(fem.Plane(2, "min"), 0.3),
-    ]
-    problem = fem.Problem.build(CUBE, NH, supports=supports, mean_dilatation=mean)
-    force = fem.Traction(fem.Plane(1, "max"), [0.01, -0.03, 0.02]).on(problem)
-    answer = fem.solve(fem.Newton(problem, linear="superlu"), load_of(force[None]))
-    assert answer.converged.all()
-    group = fem.symmetries(problem)
-    assert len(group) == 2
-    for symmetry in group:
-        image = symmetry.image(answer.displacement)
-        assert problem.relative_residual(image, symmetry.image(force)[None]) < 1e-8
-        assert_close(image[0][~problem.free], problem.prescribed[~problem.free], rtol=0, atol=1e-15)
-
-
-def test_images_keep_norms_shape_and_type(solver):
-    problem = solver.problem
-    field = torch.rand(3, 2, *problem.shape, dtype=torch.float64, generator=torch.Generator())
-    for symmetry in fem.symmetries(problem):
-        image = symmetry.image(field)
-        assert image.shape == field.shape
-        assert_close(image.norm(dim=(-2, -1)), field.norm(dim=(-2, -1)), rtol=1e-14, atol=0)
-        assert torch.equal(image[1, 0], symmetry.image(field[1, 0]))
-        single = symmetry.image(field.float())
-        assert single.dtype == torch.float32
-        assert torch.equal(single, image.float())  # turns by right angles are exact
 
 
 def test_the_order_is_always_the_same():

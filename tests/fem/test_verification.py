@@ -81,21 +81,6 @@ def test_linear_patch_has_the_printed_stress(degree):
 
 
 @pytest.mark.parametrize(
-    "material", [fem.SaintVenantKirchhoff, fem.NeoHookeanLn, fem.NeoHookeanIsoK4]
-)
-def test_patch_at_rest_resists_like_the_linear_one(material):
-    """Patch test: all laws share K(0), which balances the linear field."""
-    problem = stretched(cube_in_cube(), material(0.25), SMALL, 1)
-    linear = stretched(cube_in_cube(), fem.LinearElastic(0.25), SMALL, 1)
-    H = torch.tensor(SMALL, dtype=torch.float64)
-    field = (problem.points @ H.T)[None]
-    force = problem.tangent_product(torch.zeros_like(field), field)
-    assert force[0, 8:].abs().max() < 1e-15
-    assert force[0, :8].abs().max() > 1e-5
-    assert_close(force, linear.internal_force(field), rtol=1e-10, atol=1e-16)
-
-
-@pytest.mark.parametrize(
     ("law", "normal", "shear", "tolerance"),
     [
         (NH, 1997.3048905, 398.9029931, 1e-10),
@@ -160,52 +145,28 @@ def test_crooked_patch_passes_under_tractions(law, cell, degree, grid):
 
 
 @cache
-def measured(law: type[fem.Material], cell: str, degree: int, level: int) -> tuple[float, float]:
-    """Return the errors of a law on a mesh of the table in L2 and the H1-seminorm."""
-    amplitude = 0.1 if law is fem.NeoHookeanLn else 0.02  # SVK loses ellipticity at 0.1
-    return errors(cell, degree, ERRORS[cell, degree][0][level], law(0.3), amplitude)
+def measured(cell: str, degree: int, level: int) -> tuple[float, float]:
+    """Return the errors of NH-ln on a mesh of the table in L2 and the H1-seminorm."""
+    return errors(cell, degree, ERRORS[cell, degree][0][level])
 
 
-COARSE = [(cell, degree, level) for cell, degree in ERRORS for level in (1, 2)]
-FINE = [pytest.param(*kind, 3, marks=pytest.mark.slow) for kind in ERRORS]
-
-
-@pytest.mark.parametrize(("cell", "degree", "level"), COARSE + FINE)
+@pytest.mark.parametrize("level", [1, 2])
+@pytest.mark.parametrize(("cell", "degree"), ERRORS)
 def test_manufactured_answer_has_the_printed_error(cell, degree, level):
     """Errors of the manufactured solution; tetrahedra (another diagonal) within 10 %."""
-    found = measured(fem.NeoHookeanLn, cell, degree, level)
+    found = measured(cell, degree, level)
     for error, printed in zip(found, ERRORS[cell, degree][1:], strict=True):
         known = dict(zip((3, 2, 1, 0), map(float, reversed(printed.split())), strict=False))
         tolerance = 5e-3 if cell == "hexahedron" else 0.1
         assert level not in known or error == pytest.approx(known[level], rel=tolerance)
 
 
-@pytest.mark.parametrize(("cell", "degree", "level"), [(*kind, 2) for kind in ERRORS] + FINE)
-@pytest.mark.parametrize("law", [fem.SaintVenantKirchhoff, fem.NeoHookeanLn])
-def test_error_falls_with_the_order_of_the_element(law, cell, degree, level):
-    """Orders p + 1 - 0.1 in L2 and p - 0.05 in H1 on the last pair; twice these gaps before."""
-    coarse, fine = measured(law, cell, degree, level - 1), measured(law, cell, degree, level)
-    slack = 1 if level == 3 else 2
-    assert math.log2(coarse[0] / fine[0]) > degree + 1 - 0.1 * slack
-    assert math.log2(coarse[1] / fine[1]) > degree - 0.05 * slack
-
-
-# orders of the last pair, L2 and H1, NH-ln at A = 0.1 and SVK at A = 0.02
-ORDERS = {
-    (fem.NeoHookeanLn, "hexahedron", 1): (1.997, 1.001),
-    (fem.NeoHookeanLn, "hexahedron", 2): (2.999, 1.999),
-    (fem.SaintVenantKirchhoff, "hexahedron", 1): (1.996, 1.001),
-    (fem.SaintVenantKirchhoff, "hexahedron", 2): (2.999, 1.997),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("law", "cell", "degree"), ORDERS)
-def test_error_of_hexahedra_falls_with_the_printed_order(law, cell, degree):
-    """Orders of the manufactured solution (independent code; tetrahedra along another diagonal)."""
-    coarse, fine = (measured(law, cell, degree, level) for level in (2, 3))
-    orders = [math.log2(a / b) for a, b in zip(coarse, fine, strict=True)]
-    assert orders == pytest.approx(ORDERS[law, cell, degree], abs=1.1e-3)
+@pytest.mark.parametrize(("cell", "degree"), ERRORS)
+def test_error_falls_with_the_order_of_the_element(cell, degree):
+    """Orders above p + 1 - 0.2 in L2 and p - 0.1 in H1."""
+    coarse, fine = (measured(cell, degree, level) for level in (1, 2))
+    assert math.log2(coarse[0] / fine[0]) > degree + 1 - 0.2
+    assert math.log2(coarse[1] / fine[1]) > degree - 0.1
 
 
 @pytest.mark.slow

@@ -209,7 +209,6 @@ def bodies(
     draw,
     supports: tuple[str, ...] = HELD,
     law: st.SearchStrategy[fem.Material] | None = None,
-    inner: bool = False,
 ) -> Body:
     """Draw a body of less than 130 nodes.
 
@@ -217,15 +216,12 @@ def bodies(
         draw: Hypothesis'.
         supports: What may hold it.
         law: Any if left out.
-        inner: Whether it must have vertices inside.
     """
     cell, degree = draw(st.sampled_from(sorted(CUBOID))), draw(st.integers(1, 2))
     dim = 3 if CUBOID[cell] is fem.box else 2
     support = draw(st.sampled_from(supports))
     most = {(2, 1): 8, (2, 2): 5, (3, 1): 4, (3, 2): 3}[dim, degree]
-    least = [
-        3 if inner or (support in ("clamps", "moved") and axis == 0) else 2 for axis in range(dim)
-    ]
+    least = [3 if support in ("clamps", "moved") and axis == 0 else 2 for axis in range(dim)]
     counts = tuple(draw(st.integers(low, most)) for low in least)
     even = draw(st.booleans())
     own = draw(laws() if law is None else law)
@@ -279,21 +275,16 @@ def gradients(problem: fem.Problem, displacement: Tensor) -> Tensor:
     return torch.einsum("beai,eqaj->beqij", displacement[:, problem.cells], dN)
 
 
-def bent(problem: fem.Problem, steepness: float, seed: int, batch: int = 1) -> Tensor:
-    """Return displacements (B, N, D) of waves and some noise, the largest |H| `steepness`.
+def bent(problem: fem.Problem, steepness: float, seed: int) -> Tensor:
+    """Return a displacement (1, N, D) of waves and some noise, the largest |H| `steepness`.
 
     Below 1 they invert nothing: no singular value of F is below 1 - |H|.
     """
     random, points = np.random.default_rng(seed), problem.points.numpy()
     points = points - points.mean(axis=0)
     dim = points.shape[1]
-    waves = [
-        points @ random.standard_normal((dim, dim))
-        + np.sin(4 * points @ random.standard_normal((dim, dim)) + random.uniform(0, 6, dim))
-        + random.choice([0.0, 0.02]) * random.standard_normal(points.shape)
-        for _ in range(batch)
-    ]
-    u = torch.from_numpy(np.stack(waves))
-    return (
-        u * (steepness / gradients(problem, u).norm(dim=(-2, -1)).flatten(1).amax(1))[:, None, None]
-    )
+    waves = points @ random.standard_normal((dim, dim))
+    waves += np.sin(4 * points @ random.standard_normal((dim, dim)) + random.uniform(0, 6, dim))
+    waves += random.choice([0.0, 0.02]) * random.standard_normal(points.shape)
+    u = torch.from_numpy(waves)[None]
+    return u * steepness / gradients(problem, u).norm(dim=(-2, -1)).max()

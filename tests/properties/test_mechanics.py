@@ -1,6 +1,5 @@
 """What holds for any body, law, support and load: laws of mechanics, and what solvers promise."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 import torch
 from bodies import (
     HELD,
-    HOOKEAN,
     bent,
     bodies,
     cases,
@@ -27,7 +25,6 @@ from tried import at_most, counted
 
 from dpl import fem
 from dpl.fem.linear import full_matrix
-from dpl.fem.solvers import concatenate
 
 # Very thin, nearly incompressible cells: said in words, and answers are held to what it says.
 pytestmark = pytest.mark.filterwarnings("ignore:.*rounding allows no less:UserWarning")
@@ -65,12 +62,6 @@ def check_same(problem: fem.Problem, load: fem.Load, found: Tensor, expected: Te
     assert (found - expected).norm() <= allowed
 
 
-def turning(points: Tensor, force: Tensor) -> Tensor:
-    """Return the sum of x f^T - f x^T, (D, D), and so all moments, of points and forces (N, D)."""
-    moments = points.mT @ force
-    return moments - moments.mT
-
-
 # ---------------------------------------------------------------- energy, force, tangent
 
 
@@ -100,48 +91,6 @@ def test_turned_and_moved_body_stores_as_much_and_feels_turned_forces(
     volume = problem.dV.expand(len(problem.cells), -1).sum()
     allowed = allowed + 100 * EPS * (moduli * volume + rest.abs())
     assert (there - here).abs() <= allowed + 1e-12 * (here - rest).abs()
-
-
-@given(body=bodies(FREE), steepness=steepnesses, seed=seeds)
-@counted
-def test_forces_inside_a_body_have_neither_sum_nor_moment(body, steepness, seed):
-    """The moment of the law of small strains is that about the points at rest."""
-    problem = body.build()
-    u = bent(problem, steepness, seed)
-    force = problem.evaluate(u).internal[0]
-    allowed = slack(problem, u) * math.sqrt(len(force))
-    assert force.sum(dim=0).norm() <= allowed
-    points = problem.points - problem.points.mean(dim=0)
-    points = points if isinstance(body.law, fem.LinearElastic) else points + u[0]
-    assert turning(points, force).norm() <= allowed * points.norm(dim=1).max()
-
-
-@given(body=bodies((*HELD, "free")), steepness=logarithmic(1e-4, 0.6), seed=seeds)
-@counted
-def test_force_is_the_slope_of_the_energy(body, steepness, seed):
-    problem = body.build()
-    u = bent(problem, steepness, seed).requires_grad_()
-    (slope,) = torch.autograd.grad(problem.energy(u).sum(), u)
-    u = u.detach()
-    # an energy is differentiated term by term, and these cancel at rest: magnitudes of H = 1
-    allowed = slack(problem, u / steepness)
-    assert (torch.where(problem.free, slope - problem.internal_force(u), 0.0)).norm() <= allowed
-
-
-@given(body=bodies(), steepness=logarithmic(1e-3, 0.5), seed=seeds, along=seeds)
-@counted
-def test_tangent_is_symmetric_and_the_slope_of_the_force(body, steepness, seed, along):
-    problem = body.build()
-    u = bent(problem, steepness, seed)
-    v, w = (torch.where(problem.free, bent(problem, 1.0, along ^ k), 0.0) for k in (0, 1))
-    K, scale = stiffness(problem, u), slack(problem, v) / EPS
-    Kv, Kw = (problem.tangent_product(u, x) for x in (v, w))
-    assert ((Kv * w).sum() - (Kw * v).sum()).abs() <= EPS * scale * w.norm()
-    assert np.linalg.norm(K @ problem.restrict(v[0]) - problem.restrict(Kv[0])) <= EPS * scale
-    h = 1e-4
-    ahead, behind = (problem.evaluate(u + s * h * v).internal for s in (1, -1))
-    slope = (ahead - behind) / (2 * h)
-    assert torch.where(problem.free, slope - Kv, 0.0).norm() <= 1e-8 * scale
 
 
 class Uncompiled(fem.Problem):
@@ -174,38 +123,7 @@ def test_compiled_loops_say_what_tensors_say(body, steepness, seed, length):
         assert (system.tangent - tangent).norm() <= unit
 
 
-@given(body=bodies((*HELD, "free")), steepness=steepnesses, seed=seeds)
-@counted
-def test_batch_is_evaluated_like_its_members(body, steepness, seed):
-    problem = body.build()
-    u = bent(problem, steepness, seed, batch=3)
-    unit = slack(problem, torch.ones_like(u[:1]))
-    for k, one in enumerate(u.split(1)):
-        for name in ("internal_force", "volume_ratio", "energy", "tangent"):
-            whole, alone = getattr(problem, name)(u)[k], getattr(problem, name)(one)[0]
-            assert (whole - alone).norm() <= unit * max(1, alone.abs().max())
-        whole, alone = problem.evaluate(u), problem.evaluate(one)
-        assert torch.equal(whole.volume_ratio[k], alone.volume_ratio[0])
-        assert (whole.internal[k] - alone.internal[0]).norm() <= slack(problem, one)
-
-
 # ---------------------------------------------------------------- supports and loads
-
-
-@given(body=bodies(FREE), seed=seeds, held=st.integers(0, 7), mask=seeds)
-@counted
-def test_motions_that_are_named_loose_are_those_that_cost_nothing(body, seed, held, mask):
-    random, problem = np.random.default_rng(mask), body.build()
-    fixed = np.zeros(problem.shape, dtype=bool)
-    fixed.flat[random.choice(fixed.size, held, replace=False)] = True
-    if held:
-        problem = body.build(fixed=fixed)
-    values = np.linalg.eigvalsh(
-        stiffness(problem, torch.zeros(1, *problem.shape, dtype=torch.float64))
-    )
-    abort_if_slow = (values > 1e-12 * values[-1]) & (values < 1e-8 * values[-1])
-    assume(not abort_if_slow.any())  # nodes that are hardly out of line
-    assert len(problem.unconstrained_rigid_body_modes()) == (values < 1e-10 * values[-1]).sum()
 
 
 # ---------------------------------------------------------------- the linear solution
@@ -239,23 +157,6 @@ def test_small_loads_have_an_answer_that_follows_the_linear_one(case):
     gap = problem.tangent_product(rest, u - linear)
     gap = torch.where(problem.free, gap, 0.0).norm()
     assert gap <= answer.residual * load.force.norm() + second + slack(problem, u)
-
-
-@given(body=bodies(UNMOVED), count=st.integers(1, 5))
-@counted
-def test_modes_are_the_lowest_eigenvectors(body, count):
-    linear = fem.LinearSolver(body.build())
-    problem = linear.problem
-    assume(count <= problem.pattern.size // 3)
-    values, vectors = fem.eigenmodes(linear, count)
-    assert len(values) >= count
-    K = stiffness(problem, torch.zeros(1, *problem.shape, dtype=torch.float64))
-    exact = np.linalg.eigvalsh(K)
-    assert np.abs(values.numpy() - exact[: len(values)]).max() <= 1e-10 * exact[-1]
-    assert not vectors[~problem.free].any()
-    V = vectors[problem.free].numpy()
-    assert np.abs(V.T @ V - np.eye(V.shape[1])).max() <= 1e-9
-    assert np.linalg.norm(K @ V - V * values.numpy(), axis=0).max() <= 1e-9 * exact[-1]
 
 
 # ---------------------------------------------------------------- Newton
@@ -323,31 +224,6 @@ def test_newton_says_the_same_of_states_from_any_guess(case, steepness, seed):
     assert states[0].from_guess.item() == usable
     if not usable:
         assert torch.equal(states[-1].displacement, fem.solve(newton, load).displacement)
-
-
-@given(case=cases(low=1e-3, high=3.0))
-@counted
-def test_answer_is_in_balance_as_a_whole(case):
-    """Reactions, springs and loads have neither sum nor moment in the deformed body."""
-    body, push = case
-    newton = fem.Newton(body.build(), max_total_iter=60)
-    problem, load = newton.problem, push.on(body, newton.linear_solver)
-    answer = fem.solve(newton, load)
-    assume(answer.converged.all())
-    u, f = answer.displacement, load.force
-    internal = problem.evaluate(u).internal
-    reactions = torch.where(problem.free, 0.0, internal - f)
-    springs = 0.0 if problem.springs is None else problem.springs.force(u)
-    total = (reactions + f - springs)[0]
-    left = problem.residual(u, f).norm()
-    # rounding on held nodes is not in `Problem.roundoff_bound`
-    allowed = math.sqrt(len(total)) * (
-        left + 100 * EPS * total.norm() + slack(body.build(fixed=None), u)
-    )
-    assert total.sum(dim=0).norm() <= allowed
-    points = problem.points - problem.points.mean(dim=0)
-    points = points if isinstance(body.law, fem.LinearElastic) else points + u[0]
-    assert turning(points, total).norm() <= 2 * allowed * points.norm(dim=1).max()
 
 
 @given(case=cases(low=1e-2, high=3.0))
@@ -441,66 +317,6 @@ def test_ways_to_solve_change_the_way_and_not_the_answer(case, data):
         again = fem.solve(fem.Newton(problem, **({"max_total_iter": 200} | change)), load)
         assert again.stable.all()
         check_same(problem, load, again.displacement, answer.displacement)
-
-
-@at_most(0.5)
-@given(body=bodies(), data=st.data())
-@counted
-def test_batch_is_solved_like_its_members(body, data):
-    """To the last bit, with factors of one's own; MKL holds one at a time."""
-    backend = data.draw(
-        st.sampled_from([name for name in fem.installed_backends() if name != "pardiso"])
-    )
-    newton = fem.Newton(body.build(), max_total_iter=30, linear=backend)
-    drawn = data.draw(st.lists(pushes(body, 1e-3), min_size=2, max_size=4))
-    loads = [push.on(body, newton.linear_solver) for push in drawn]
-    batch = fem.solve(newton, load_of(torch.cat([load.force for load in loads])))
-    alone = concatenate([fem.solve(newton, load) for load in loads])
-    for name in ("displacement", "status", "residual", "iterations", "load_factor"):
-        assert torch.equal(getattr(batch, name), getattr(alone, name))
-
-
-@at_most(0.5)
-@given(
-    body=bodies(),
-    kind=st.sampled_from(HOOKEAN),
-    ratios=st.lists(st.floats(-0.4, 0.45), min_size=2, max_size=3),
-    data=st.data(),
-)
-@counted
-def test_loads_with_their_own_parameters_are_solved_like_bodies_of_one(body, kind, ratios, data):
-    some = fem.Newton(
-        replace(body, law=kind([-0.5, 0.46])).build(), max_total_iter=40, linear="superlu"
-    )
-    forces = [
-        data.draw(pushes(body, 1e-3, 0.5)).on(body, some.linear_solver.reference).force
-        for _ in ratios
-    ]
-    poisson = torch.tensor(ratios, dtype=torch.float64)
-    load = fem.Load(torch.cat(forces), torch.ones(len(ratios), dtype=torch.float64), poisson)
-    batch = fem.solve(some, load)
-    for k, nu in enumerate(ratios):
-        problem = replace(body, law=kind(nu)).build()
-        alone = fem.solve(
-            fem.Newton(problem, max_total_iter=40, linear="superlu"), load_of(forces[k])
-        )
-        for name in ("status", "displacement", "residual"):
-            assert torch.equal(getattr(batch, name)[k], getattr(alone, name)[0])
-
-
-@given(body=bodies(FREE, inner=True), steepness=logarithmic(1e-6, 0.1), seed=seeds)
-@counted
-def test_homogeneous_deformation_of_the_surface_is_one_of_the_whole(body, steepness, seed):
-    """The patch test on shaken grids, all elements and laws."""
-    H = torch.from_numpy(np.random.default_rng(seed).standard_normal((body.dim, body.dim)))
-    plain = body.build()
-    exact = plain.points @ (steepness * H / H.norm()).mT
-    held = plain.boundary.numpy()
-    problem = body.build(fixed=held, prescribed=exact.numpy())
-    load = load_of(torch.zeros(1, *problem.shape, dtype=torch.float64))
-    answer = fem.solve(fem.Newton(problem), load)
-    assert answer.status.item() == fem.Status.CONVERGED
-    check_same(problem, load, answer.displacement, exact[None])
 
 
 @given(case=cases(low=1e-3, high=1.0))

@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from dpl.fem.assembly.follower_pressure import PressureSurface
-from dpl.fem.loads.combined import CombinedLoads, VectorLoads
+from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.forces import ROUNDOFF, body_force, facet_areas
-from dpl.fem.loads.options import option
 from dpl.fem.loads.sampling import Array
-from dpl.fem.loads.sized import rounded
-from dpl.fem.loads.surface import SurfaceLoads
+from dpl.fem.loads.sized import CombinedLoads, VectorLoads, rounded
+from dpl.fem.options import option
 from dpl.fem.problem import Problem
 from dpl.system.checks import named_errors
 
@@ -26,8 +25,7 @@ INWARD = 1e-7  # shift of points on the surface into their cell, over the distan
 class FaceTractions(SurfaceLoads, VectorLoads):
     """Uniform dead traction of random direction and size on the whole region.
 
-    The point of a load has the size and the direction, then Young's modulus and, where the law has
-    ranges, its parameters.
+    The numbers of a force are its size and its direction.
 
     Attributes:
         largest: Largest traction [Pa]; None: `deflection` decides.
@@ -48,8 +46,7 @@ class FacePressure(SurfaceLoads, CombinedLoads):
 
     It acts against the outward normal of the undeformed body.
 
-    The point of a load has the size, then Young's modulus and, where the law has ranges, its
-    parameters.
+    The number of a force is its size.
 
     Attributes:
         pressure: Smallest and largest pressure [Pa]; None: from 0, `deflection` decides.
@@ -72,8 +69,7 @@ class GravityLoads(VectorLoads):
 
     The nodal forces are consistent: at corners of quadratic tetrahedra they act against gravity.
 
-    The point of a load has the size and the direction, then Young's modulus and, where the law has
-    ranges, its parameters.
+    The numbers of a force are its size and its direction.
 
     Attributes:
         density: Mass per rest volume [kg/m^3]; None: `deflection` decides.
@@ -108,8 +104,7 @@ class CableLoads(CombinedLoads):
     T (t_next - t_previous), and on an end T towards its neighbour. These are dead loads. The shape
     functions of its cell distribute the force on a point to nodes.
 
-    The point of a load has the tension of each cable, then Young's modulus and, where the law has
-    ranges, its parameters.
+    The numbers of a force are the tensions of the cables.
 
     Attributes:
         cables: Points of each cable in order, two or more, D coordinates each [m].
@@ -126,11 +121,7 @@ class CableLoads(CombinedLoads):
 
     @cached_property
     def shapes(self) -> Tensor:
-        """Force of the tension 1 in each cable, (K, N, D) [-].
-
-        Raises:
-            ValueError: There is no cable, it has no two points, or one lies outside the body.
-        """
+        """Force of the tension 1 in each cable, (K, N, D) [-]."""
         if not self.cables:
             raise ValueError("cables = [] must contain a cable: a list of points [m]")
         return torch.stack([self._shape(k) for k in range(len(self.cables))])
@@ -165,11 +156,7 @@ class CableLoads(CombinedLoads):
 
 
 def shape_functions(problem: Problem, points: Array) -> Array:
-    """Return the values of all shape functions at points (P, D) [-] of the body, (P, N).
-
-    Raises:
-        ValueError: A point lies outside the body.
-    """
+    """Return the values of all shape functions at points (P, D) [-] of the body, (P, N)."""
     basis, mesh = problem.basis, problem.mesh
     centres = mesh.p[:, mesh.t].mean(axis=1).T  # (cells, D)
     values = np.zeros((len(points), basis.N))

@@ -1,4 +1,4 @@
-"""Load families: the interface that the package needs, and a base class for new ones."""
+"""Load families: the interface that the package needs, and base classes for new ones."""
 
 import math
 from abc import abstractmethod
@@ -9,15 +9,18 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.identity import identity_of
-from dpl.fem.loads.options import check_options
+from dpl.fem.identity import identity_of, plain
 from dpl.fem.loads.sampling import SAMPLINGS, Array
+from dpl.fem.mesh.regions import Region, facets_in
+from dpl.fem.options import check_options
 from dpl.fem.problem import Problem
 from dpl.fem.ranges import ParameterRange, Young
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
+from dpl.system.checks import named_errors
 
 MAX_DISTANCE = 1e-3  # distance from a family up to which a force counts as a load of it [-]
 
@@ -84,7 +87,7 @@ class LoadFamily(Protocol):
     def sample(
         self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0
     ) -> Load:
-        """Return loads `indices` of a stream, their forces multiplied by `amplitude`."""
+        """Return loads `indices` of the stream `seed`, their forces multiplied by `amplitude`."""
         ...
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
@@ -137,6 +140,9 @@ class RandomLoads(LoadFamily):
     recognise its forces, and `loadable_dofs` if it loads nodes inside the body. Options that it
     declares by `option` are checked here.
 
+    The point of a load has the numbers of its force, then Young's modulus and, where the law has
+    ranges, its parameters.
+
     Attributes:
         linear: Body, with the factor of its K(0).
         young: Young's modulus [Pa], a range [low, high] from which each load draws one, or
@@ -176,12 +182,10 @@ class RandomLoads(LoadFamily):
 
     @cached_property
     def moduli(self) -> ParameterRange:
-        """Range of Young's moduli with its distribution [Pa]."""
         return ParameterRange.of_young(self.young)
 
     @property
     def parameter_ranges(self) -> Mapping[str, ParameterRange]:
-        """Ranges of what differs between loads beside these, see `Problem.parameter_ranges`."""
         return self.problem.parameter_ranges
 
     @property
@@ -195,24 +199,20 @@ class RandomLoads(LoadFamily):
         return self.n_force + 1 + len(self.parameter_ranges)
 
     def points(self, seed: int | Sequence[int], indices: Sequence[int]) -> Tensor:
-        """Return the points of the unit cube of loads `indices` of a stream, (B, d)."""
         drawn = [SAMPLINGS[self.sampling](seed, index, self.n_random) for index in indices]
         return torch.from_numpy(np.stack(drawn))
 
     def loads_at(self, points: Tensor) -> Load:
-        """Return the loads of points (B, d) of the unit cube."""
         force = torch.stack([self.force_at(point[: self.n_force].numpy()) for point in points])
         if self.constant_force is not None:
             force = force + self.constant_force
         return Load(force, self.young_at(points), self.parameters_at(points))
 
     def young_at(self, points: Tensor) -> Tensor:
-        """Return the Young's moduli of points (B, d), (B,) [Pa]."""
         moduli: Tensor = self.moduli.at(points[:, self.n_force])
         return moduli.clamp(*self.moduli)  # rounding of a power
 
     def parameters_at(self, points: Tensor) -> Tensor:
-        """Return the parameters of the law of points (B, d), (B, P), see `parameter_ranges`."""
         own = points[:, self.n_force + 1 :]
         pairs = zip(self.parameter_ranges.values(), own.unbind(1), strict=True)
         columns = [ends.at(column) for ends, column in pairs]
@@ -221,13 +221,6 @@ class RandomLoads(LoadFamily):
     def sample(
         self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0
     ) -> Load:
-        """Return loads.
-
-        Args:
-            seed: Name of the stream.
-            indices: Numbers of the loads in the stream, B of them.
-            amplitude: Factor on all forces [-].
-        """
         load = self.loads_at(self.points(seed, indices))
         return load._replace(force=amplitude * load.force)
 
@@ -251,13 +244,48 @@ class RandomLoads(LoadFamily):
         return size / self.largest_force, distance
 
     def arrays(self) -> Mapping[str, Tensor]:
-        """Return no arrays."""
         return {}
 
     def identity(self) -> dict[str, Any]:
-        """Return all options but the body and Young's modulus, see `LoadFamily.identity`."""
         return identity_of(self, exclude=("linear", "young"))
 
     def skipped_work(self) -> list[str]:
-        """Return no notes."""
         return []
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceLoads(RandomLoads):
+    """Base of load families that act on facets of the boundary.
+
+    Attributes:
+        region: Part of the boundary, see `dpl.fem.mesh.facets_in`; None for all of it.
+    """
+
+    _: KW_ONLY
+    region: Region | None = None
+
+    @cached_property
+    def facets(self) -> NDArray[np.int_]:
+        """Numbers of the boundary facets on which these loads act, (E,)."""
+        problem = self.problem
+        if self.region is None:
+            return np.asarray(problem.mesh.boundary_facets())
+        with named_errors("region = "):
+            return facets_in(self.region, problem.mesh, problem.length, problem.origin)
+
+    @cached_property
+    def loadable_dofs(self) -> Tensor:
+        """Free degrees of freedom of the nodes of `facets`, (N, D), boolean."""
+        nodes = torch.zeros(self.problem.shape[0], dtype=torch.bool)
+        nodes[self.problem.basis.get_dofs(self.facets).all()] = True
+        loadable = nodes[:, None] & self.problem.free
+        if not loadable.any():
+            words = "the boundary" if self.region is None else f"region = {self.region}"
+            raise ValueError(f"{words} is fixed everywhere; loads must act on a free node")
+        return loadable
+
+    def identity(self) -> dict[str, Any]:
+        """Return the options; a region is identified by the facets that it selects."""
+        options = super().identity()
+        del options["region"]
+        return options if self.region is None else options | {"region": plain(self.facets)}

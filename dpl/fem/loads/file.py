@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.identity import plain
-from dpl.fem.loads.combined import CombinedLoads
 from dpl.fem.loads.fit import best_fit
-from dpl.fem.loads.options import option
 from dpl.fem.loads.sampling import Array
+from dpl.fem.loads.sized import CombinedLoads
+from dpl.fem.options import option
 from dpl.system.files import read_array
 
 
@@ -23,8 +23,7 @@ from dpl.system.files import read_array
 class FileLoads(CombinedLoads):
     """One of the forces of a file times a random factor.
 
-    The point of a load has the number of the force and the factor, then Young's modulus and, where
-    the law has ranges, its parameters.
+    The numbers of a force are its number in the file and the factor.
 
     Attributes:
         path: An array in .npy, or a .npz file with one array: nodal forces (S, N, D) [N] (2D:

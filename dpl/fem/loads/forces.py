@@ -3,7 +3,6 @@
 What holds the body (clamps, springs) is in `dpl.fem.assembly.boundary_conditions`.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 
@@ -15,6 +14,7 @@ from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from dpl.fem.mesh.regions import Region, facets_in
+from dpl.fem.options import check_options, option
 from dpl.fem.problem import Problem
 from dpl.fem.units import vector
 
@@ -36,12 +36,7 @@ class Traction:
     value: Sequence[float]
 
     def on(self, problem: Problem) -> Tensor:
-        """Return the nodal forces (N, D) over E L^(D - 1) [-].
-
-        Raises:
-            ValueError: The region holds no boundary facet, `value` has not D finite numbers, or the
-                problem has no modulus.
-        """
+        """Return the nodal forces (N, D) over E L^(D - 1) [-]."""
         value = vector("value", self.value, problem.shape[1], "Pa")
         stress = problem.units.stress(value, f"value = {list(self.value)}")
         return traction(problem, self.region, _constant(stress), problem.length)
@@ -63,7 +58,7 @@ class BodyForce:
     value: Sequence[float] | None = None
     _: KW_ONLY
     acceleration: Sequence[float] | None = None
-    density: float | None = None
+    density: float | None = option("kg/m^3", default=None, above=0.0)
 
     def __post_init__(self) -> None:
         remedy = "give value [N/m^3] alone, or acceleration [m/s^2] and density [kg/m^3]"
@@ -72,16 +67,10 @@ class BodyForce:
             if (given is None) == (self.value is None):
                 condition = "be given" if given is None else "be left out where value is given"
                 raise ValueError(f"{name} = {given} must {condition}; {remedy}")
-        if self.density is not None and not 0 < self.density < math.inf:
-            raise ValueError(f"density = {self.density} must be a number above 0 [kg/m^3]")
+        check_options(self)
 
     def on(self, problem: Problem) -> Tensor:
-        """Return the nodal forces (N, D) over E L^(D - 1) [-].
-
-        Raises:
-            ValueError: `value` or `acceleration` has not D finite numbers, or the problem has no
-                modulus.
-        """
+        """Return the nodal forces (N, D) over E L^(D - 1) [-]."""
         dim = problem.shape[1]
         if self.value is not None:
             words = f"value = {list(self.value)}"
@@ -107,7 +96,7 @@ def body_force(problem: Problem, density: Field) -> Tensor:
         density: Force density times L/E [-] at dimensionless points; (D, ...) to (D, ...).
     """
     basis = problem.basis
-    return _tested(problem, basis, density(_places(problem, basis)))
+    return _tested(basis, density(_places(problem, basis)))
 
 
 def traction(problem: Problem, region: Region, stress: Field, scale: float = 1.0) -> Tensor:
@@ -119,13 +108,10 @@ def traction(problem: Problem, region: Region, stress: Field, scale: float = 1.0
         stress: Traction over E [-] at dimensionless points; (D, ...) to (D, ...).
         scale: Length of which the region's coordinates are multiples [m]; 1 for a region that
             takes dimensionless points.
-
-    Raises:
-        ValueError: The region holds no boundary facet.
     """
     facets = facets_in(region, problem.mesh, scale, problem.origin)
     basis = _facet_basis(problem, facets)
-    return _tested(problem, basis, stress(_places(problem, basis)))
+    return _tested(basis, stress(_places(problem, basis)))
 
 
 def facet_areas(problem: Problem, facets: NDArray[np.int_]) -> csr_matrix:
@@ -154,15 +140,8 @@ def _places(problem: Problem, basis: skfem.Basis) -> NDArray[np.float64]:
     return np.asarray(basis.global_coordinates()) + problem.origin[:, None, None]
 
 
-def _tested(problem: Problem, basis: skfem.Basis, values: NDArray[np.float64]) -> Tensor:
+def _tested(basis: skfem.Basis, values: NDArray[np.float64]) -> Tensor:
     """Return the integral of values (D, E, Q) against each shape function, (N, D)."""
-    dim = problem.points.shape[1]
-    force = np.zeros((basis.N, dim))
-    for a, dofs in enumerate(basis.element_dofs):
-        shape = np.asarray(basis.basis[a][0]) * basis.dx  # (E, Q)
-        np.add.at(
-            force,
-            dofs,
-            np.einsum("deq,eq->ed", np.broadcast_to(values, (dim, *shape.shape)), shape),
-        )
-    return torch.from_numpy(force)
+    rows = np.broadcast_to(values, (len(values), *basis.dx.shape))
+    forces = [skfem.LinearForm(lambda v, _, row=row: row * v).assemble(basis) for row in rows]
+    return torch.from_numpy(np.stack(forces, axis=1))

@@ -21,8 +21,8 @@ from dpl.system.checks import named_errors
 class MixtureLoads(RandomLoads):
     """Loads of several families; each load belongs to one of them, which is drawn by weights.
 
-    The point of a load has the family, then the numbers of its force, as many as the largest family
-    needs, then Young's modulus and, where the law has ranges, its parameters.
+    The numbers of a force are that of the family, then those of its force; the largest family
+    decides how many.
 
     Attributes:
         families: Families by name: each a function of `linear` and the keywords `young` and
@@ -60,12 +60,7 @@ class MixtureLoads(RandomLoads):
 
     @cached_property
     def members(self) -> tuple[RandomLoads, ...]:
-        """The families, without constant force.
-
-        Raises:
-            ValueError: An option of a family is out of range.
-            TypeError: A family is not a `RandomLoads`.
-        """
+        """The families, without constant force."""
         members = []
         for name, family in self.families.items():
             with named_errors(f"families.{name}: "):
@@ -89,7 +84,6 @@ class MixtureLoads(RandomLoads):
         return torch.searchsorted(ends / ends[-1], points[:, 0].double().contiguous(), right=True)
 
     def force_at(self, point: Array) -> Tensor:
-        """Return the force (N, D) [-] of a point (n_force,) of the unit cube."""
         member = self.members[int(self.family_of(torch.from_numpy(point)[None]))]
         return member.force_at(point[1 : 1 + member.n_force])
 

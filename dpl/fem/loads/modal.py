@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.fit import amplitudes, fit
 from dpl.fem.loads.modal_basis import Modes, eigenmodes
-from dpl.fem.loads.options import option
 from dpl.fem.loads.sampling import Array, Quantile, constant, symmetric_uniform, uniform01
 from dpl.fem.loads.sized import MIN_DEFLECTION
-from dpl.fem.loads.surface import SurfaceLoads
+from dpl.fem.options import option
 
 TESTED = np.linspace(0.0, 1 - 2.0**-53, 1001)  # numbers at which distributions are examined
 
@@ -34,8 +34,7 @@ class ModalLoads(SurfaceLoads):
     The force is multiplied by a random amplitude and set to 0 outside the boundary nodes within a
     random distance of a random node.
 
-    The point of a load has one number per mode, then centre, radius and amplitude, then Young's
-    modulus and, where the law has ranges, its parameters.
+    The numbers of a force are one per mode, then centre, radius and amplitude.
 
     Attributes:
         n_modes: Smallest number of modes. A cluster of close eigenvalues is never divided, so that
@@ -75,12 +74,7 @@ class ModalLoads(SurfaceLoads):
 
     @cached_property
     def eigenmodes(self) -> Modes:
-        """Modes that are excited.
-
-        Raises:
-            ValueError: There is no such mode; see `eigenmodes`.
-            SingularMatrix: See `eigenmodes`.
-        """
+        """Modes that are excited."""
         if self.modes is None:
             return eigenmodes(self.linear, self.n_modes)
         last = self.problem.pattern.size // 3 - 1
@@ -113,7 +107,6 @@ class ModalLoads(SurfaceLoads):
         return len(self.q_max) + 3
 
     def force_at(self, point: Array) -> Tensor:
-        """Return the force (N, D) [-] of a point (n_force,) of the unit cube."""
         centre, radius, amplitude = point[-3:]
         q = self.q_max * torch.from_numpy(self.distribution(point[:-3]))
         q = float(self.amplitude(np.asarray(amplitude))) * q

@@ -12,11 +12,11 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
+from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.forces import ROUNDOFF, facet_areas
-from dpl.fem.loads.options import option
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import SizedLoads, largest_deflection, softest_node
-from dpl.fem.loads.surface import SurfaceLoads
+from dpl.fem.options import option
 
 MAX_ROUNDS = 5  # of decisions about loaded facets; a disc away from supports needs one or two
 
@@ -29,8 +29,7 @@ class PatchLoads(SurfaceLoads, SizedLoads):
     vertices are all within a random distance of it. The distance is the length of the shortest path
     along edges and diagonals of facets, so that a disc does not jump across a gap.
 
-    The point of a load has centre, radius, size and direction, then Young's modulus and, where the
-    law has ranges, its parameters.
+    The numbers of a force are centre, radius, size and direction.
 
     Attributes:
         largest: Largest traction [Pa]; None: `deflection` decides, with the largest disc around the
@@ -64,7 +63,6 @@ class PatchLoads(SurfaceLoads, SizedLoads):
         return self.problem.shape[1] + 2
 
     def force_at(self, point: Array) -> Tensor:
-        """Return the force (N, D) [-] of a point (n_force,) of the unit cube."""
         low, high = self.patch_radius
         vertex = int(self.centres[int(point[0] * len(self.centres))])
         weights = self.weights_of(vertex, low + (high - low) * float(point[1]))

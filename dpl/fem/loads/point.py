@@ -8,18 +8,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.loads.options import option
+from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import SizedLoads, largest_deflection, point_forces, softest_node
-from dpl.fem.loads.surface import SurfaceLoads
+from dpl.fem.options import option
 
 
 @dataclass(frozen=True, eq=False)
 class PointLoads(SurfaceLoads, SizedLoads):
     """Forces of random direction and size on a few random nodes of the boundary.
 
-    The point of a load has the number of forces, then node, size and direction of each, then
-    Young's modulus and, where the law has ranges, its parameters.
+    The numbers of a force are the number of forces, then node, size and direction of each.
 
     Attributes:
         largest: Largest force [N] (2D: [N/m]); None: `deflection` decides, with all forces at the
@@ -32,11 +31,7 @@ class PointLoads(SurfaceLoads, SizedLoads):
 
     @cached_property
     def nodes(self) -> Tensor:
-        """Nodes on which a force can act, ascending, (n,).
-
-        Raises:
-            ValueError: There are fewer than the largest number of forces.
-        """
+        """Nodes on which a force can act, ascending, (n,)."""
         nodes = self.loadable_dofs.any(dim=1).nonzero()[:, 0]
         if len(nodes) < self.count[1]:
             raise ValueError(
@@ -63,7 +58,6 @@ class PointLoads(SurfaceLoads, SizedLoads):
         return 1 + (1 + self.problem.shape[1]) * self.count[1]
 
     def force_at(self, point: Array) -> Tensor:
-        """Return the force (N, D) [-] of a point (n_force,) of the unit cube."""
         low, high = self.count
         count = low + int(point[0] * (high - low + 1))
         force = torch.zeros(self.problem.shape, dtype=torch.float64)

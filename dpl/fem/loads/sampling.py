@@ -70,22 +70,14 @@ def constant(t: Array) -> Array:
 
 
 def logarithmic(t: Array, low: float = 1e-2) -> Array:
-    """Return numbers in [low, 1) of which every decade holds as many.
-
-    Raises:
-        ValueError: `low` lies outside (0, 1).
-    """
+    """Return numbers in [low, 1) of which every decade holds as many."""
     if not 0 < low < 1:
         raise ValueError(f"low = {low} must lie between 0 and 1")
     return low ** (1 - t)
 
 
 def log_tail_mixture(t: Array, part: float = 0.25, low: float = 1e-3) -> Array:
-    """Return 1, but for a part of the draws that is logarithmic in [low, 1): small loads.
-
-    Raises:
-        ValueError: `part` or `low` lies outside (0, 1).
-    """
+    """Return 1, but for a part of the draws that is logarithmic in [low, 1): small loads."""
     if not 0 < part < 1:
         raise ValueError(f"part = {part} must lie between 0 and 1")
     return np.where(t < part, logarithmic(np.minimum(t / part, 1.0), low), 1.0)

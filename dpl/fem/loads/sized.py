@@ -1,4 +1,4 @@
-"""Base of load families whose size is given in SI units or follows from a linear deflection."""
+"""Bases of load families whose size is given in SI units or follows from a linear deflection."""
 
 import math
 from abc import abstractmethod
@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from dpl.fem.loads.family import RandomLoads
-from dpl.fem.loads.fit import amplitudes
-from dpl.fem.loads.options import DIMENSIONLESS, declared, option, shown
+from dpl.fem.loads.fit import amplitudes, fit
 from dpl.fem.loads.sampling import Array, direction
+from dpl.fem.options import DIMENSIONLESS, declared, option, shown
 from dpl.fem.solvers.linear import LinearSolver
 
 MIN_DEFLECTION = 1e-12  # below it the displacement is rounding error [-]
@@ -39,11 +39,7 @@ class SizedLoads(RandomLoads):
 
     @property
     def given_sizes(self) -> Array | None:
-        """Smallest and largest size in the options, (2,) [-]; None if `deflection` decides.
-
-        Raises:
-            ValueError: The loads have a range of moduli.
-        """
+        """Smallest and largest size in the options, (2,) [-]; None if `deflection` decides."""
         name, units = self.size_option, self.problem.units
         if (value := getattr(self, name)) is None:
             return None
@@ -61,11 +57,7 @@ class SizedLoads(RandomLoads):
 
     @cached_property
     def sizes(self) -> tuple[float, float]:
-        """Smallest and largest size [-].
-
-        Raises:
-            ValueError: The loads have a range of moduli, or do not deflect the body.
-        """
+        """Smallest and largest size [-]."""
         if (given := self.given_sizes) is not None:
             return float(given[0]), float(given[1])
         unit = self.unit_deflection
@@ -106,6 +98,119 @@ class SizedLoads(RandomLoads):
         """Pickle with the sizes, so that workers need not compute them again."""
         self.sizes  # noqa: B018
         return self.__dict__
+
+
+@dataclass(frozen=True, eq=False)
+class CombinedLoads(SizedLoads):
+    """Base of load families of forces sum_k c_k f_k with few fixed forces f_k.
+
+    The coefficients are independent, each a random size. A subclass defines `shapes`.
+    """
+
+    @property
+    @abstractmethod
+    def shapes(self) -> Tensor:
+        """Fixed forces f_k, (K, N, D) [-]."""
+
+    @property
+    def n_force(self) -> int:
+        """Number of random numbers: K, one for each coefficient."""
+        return len(self.shapes)
+
+    def coefficients_at(self, point: Array) -> Array:
+        """Return the coefficients (K,) of a point (n_force,) of the unit cube."""
+        return self.size_at(point)
+
+    @property
+    def coefficient_range(self) -> tuple[float, float]:
+        """Smallest and largest coefficient [-]."""
+        return self.sizes
+
+    def sizes_of(self, coefficients: Array) -> Array:
+        """Return the sizes of coefficients (K,), which have the range `sizes`."""
+        return coefficients
+
+    @property
+    def unit_deflection(self) -> float:
+        """Largest linear deflection [-] of the sum of all f_k, if their signs add up at a node."""
+        moved = [self.linear.reference.solve_force(shape).norm(dim=1) for shape in self.shapes]
+        return float(torch.stack(moved).sum(dim=0).max())
+
+    @property
+    def unit_force(self) -> float:
+        """Norm of all f_k [-], as if they acted on different nodes."""
+        return float(self.problem.acting(self.shapes).norm())
+
+    @property
+    def largest_force(self) -> float:
+        """Norm of the largest force [-]."""
+        size = self.largest_size
+        if not (norm := size * self.unit_force) > 0:
+            raise ValueError("these loads act on fixed nodes only; they must act on a free node")
+        return norm
+
+    @cached_property
+    def loadable_dofs(self) -> Tensor:
+        """Free degrees of freedom on which a force acts, (N, D), boolean."""
+        return (self.shapes != 0).any(dim=0) & self.problem.free
+
+    def force_at(self, point: Array) -> Tensor:
+        return torch.tensordot(torch.from_numpy(self.coefficients_at(point)), self.shapes, dims=1)
+
+    def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
+        """Return amplitudes and relative residuals of a least-squares fit, see `LoadFamily`."""
+        shapes, span = self._acting_shapes, self.coefficient_range
+        fits = [fit(shapes, own, *span) for own in self.own_force(force).flatten(1).numpy()]
+        largest = [self.amplitudes(self.sizes_of(c)).max() for c, _ in fits]
+        return force.new_tensor(largest), force.new_tensor([rest for _, rest in fits])
+
+    @cached_property
+    def _acting_shapes(self) -> Array:
+        """The f_k on free degrees of freedom, (N D, K)."""
+        return self.problem.acting(self.shapes).flatten(1).numpy().T
+
+
+@dataclass(frozen=True, eq=False)
+class VectorLoads(CombinedLoads):
+    """Base of load families of a vector of random size and direction times fixed nodal weights.
+
+    A subclass defines `weights`.
+    """
+
+    @property
+    @abstractmethod
+    def weights(self) -> Tensor:
+        """Force of a unit vector at each node, (N,) [-]."""
+
+    @cached_property
+    def shapes(self) -> Tensor:
+        """Forces of the unit vectors along the axes, (D, N, D) [-]."""
+        axes = torch.eye(self.problem.shape[1], dtype=torch.float64)
+        return torch.einsum("n,kd->knd", self.weights, axes)
+
+    def coefficients_at(self, point: Array) -> Array:
+        """Return the vector (D,) of a point (D,) of the unit cube."""
+        return self.vector_at(point)
+
+    @property
+    def coefficient_range(self) -> tuple[float, float]:
+        """Smallest and largest component of a vector [-]."""
+        return -self.largest_size, self.largest_size
+
+    def sizes_of(self, coefficients: Array) -> Array:
+        """Return the norm of a vector (D,), (1,)."""
+        return np.linalg.norm(coefficients[None], axis=1)
+
+    @property
+    def unit_deflection(self) -> float:
+        """Largest linear deflection [-] of the unit vectors of all directions."""
+        return largest_deflection(self.linear.reference, self.shapes)
+
+    @property
+    def unit_force(self) -> float:
+        """Largest norm [-] of the forces of the unit vectors of all directions."""
+        shapes = self.problem.acting(self.shapes).flatten(1)
+        return float(torch.linalg.matrix_norm(shapes, 2))
 
 
 def rounded(values: Array) -> list[float]:

@@ -31,9 +31,6 @@ class Heterogeneous(Composed, Material):
         regions: The regions, by name. A name that is not there is a tag of cells of the mesh, or
             `other`, the cells of no other region.
         layout: Cells of the laws; None before `on`.
-
-    Raises:
-        ValueError: There is no law, or laws of small and of finite strains are mixed.
     """
 
     laws: Mapping[str, Material]
@@ -58,11 +55,7 @@ class Heterogeneous(Composed, Material):
     # ------------------------------------------------------------------ cells
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
-        """Return the laws of the cells of a body, see `Material.on`.
-
-        Raises:
-            ValueError: A region contains no cell, or a cell belongs to two regions or to none.
-        """
+        """Return the laws of the cells of a body, see `Material.on`."""
         count = basis.mesh.nelements
         index = np.full(count, -1)
         for k, name in enumerate(self.laws):
@@ -141,7 +134,6 @@ class Heterogeneous(Composed, Material):
         return all(law.has_response for law in self.laws.values())
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, (B, E, Q) [-], see `Material.energy`."""
         return self._of_all_cells(lambda law, H: law.energy(H), H)
 
     def volumetric_energy(self, j: Tensor) -> Tensor:
@@ -151,19 +143,15 @@ class Heterogeneous(Composed, Material):
         return self._of_all_cells(lambda law, j: law.pressure(j), j)
 
     def stress(self, H: Tensor) -> Tensor:
-        """Return the first Piola-Kirchhoff stress, see `Material.stress`."""
         return self._of_all_cells(lambda law, H: law.stress(H), H)
 
     def tangent(self, H: Tensor) -> Tensor:
-        """Return dP/dF, see `Material.tangent`."""
         return self._of_all_cells(lambda law, H: law.tangent(H), H)
 
     def rest_stress(self, H: Tensor) -> Tensor:
-        """Return the stress of small strains, see `Material.rest_stress`."""
         return self._of_all_cells(lambda law, H: law.rest_stress(H), H)
 
     def response(self, E: Tensor) -> Response:
-        """Return stress and moduli, see `Material.response`."""
         parts = [law.response(E[:, cells]) for law, cells in self._groups]
         order = self._layout.order
         joined = (torch.cat(one, dim=1)[:, order] for one in zip(*parts, strict=True))

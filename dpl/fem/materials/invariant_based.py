@@ -51,7 +51,6 @@ class InvariantBasedMaterial(Material):
         raise NotImplementedError
 
     def response(self, E: Tensor) -> Response:
-        """Return stress and moduli, see `Material.response`."""
         square = invariants(2 * E)[2]
         return self._response(E, square / (1 + (1 + square).sqrt()))
 

@@ -1,18 +1,18 @@
 """Laws of the isochoric invariants Ib1 = J^(-2/3) I1 and Ib2 = J^(-4/3) I2 and of the volume."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from dpl.fem.identity import OPTIONAL
 from dpl.fem.materials.arithmetic import exp
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import BulkOrPoisson, check_moduli
 from dpl.fem.materials.parameters import Constant
 from dpl.fem.materials.tensors import green_lagrange, invariants, volume_change
 from dpl.fem.materials.volumetric import k2_derivatives
+from dpl.fem.options import option
 
 
 def isochoric_derivatives(
@@ -71,7 +71,7 @@ class PolynomialMaterial(InvariantBasedMaterial):
     2 (c10 + c01). The volumetric term is that of Abaqus (D1 = 2/bulk).
     """
 
-    shear_name: ClassVar[str]  # of the shear modulus at rest, in a message
+    shear_name: ClassVar[str] = "2 (c10 + c01)"  # of the shear modulus at rest, in a message
 
     def check_constants(self) -> None:
         """Check that the body resists shear and compression."""
@@ -79,7 +79,6 @@ class PolynomialMaterial(InvariantBasedMaterial):
         check_moduli(self.shear_name, 2 * (numbers[0] + numbers[3]), numbers[4], numbers)
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         i1, i2, j = isochoric_invariants(H)
         c10, c20, c30, c01, bulk = self.constants
         return i1 * (c10 + i1 * (c20 + i1 * c30)) + c01 * i2 + bulk / 2 * j.square()
@@ -88,7 +87,6 @@ class PolynomialMaterial(InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
         return polynomial_derivatives(c, i1, i2, m1, k2_derivatives(c[4], j))
 
 
@@ -107,12 +105,11 @@ class MooneyRivlinK2(BulkOrPoisson, PolynomialMaterial):
 
     ranged: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk", "poisson")
     dimensional: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk")
-    shear_name: ClassVar[str] = "2 (c10 + c01)"
 
     c10: Constant
     c01: Constant
     bulk: Constant | None = None
-    poisson: Constant | None = field(default=None, metadata=OPTIONAL)
+    poisson: Constant | None = option("", default=None, above=-1.0, below=0.5, optional=True)
 
     @property
     def mu(self) -> Tensor:
@@ -146,7 +143,7 @@ class YeohK2(BulkOrPoisson, PolynomialMaterial):
     c20: Constant
     c30: Constant
     bulk: Constant | None = None
-    poisson: Constant | None = field(default=None, metadata=OPTIONAL)
+    poisson: Constant | None = option("", default=None, above=-1.0, below=0.5, optional=True)
 
     @property
     def mu(self) -> Tensor:
@@ -180,20 +177,16 @@ class DemirayK2(BulkOrPoisson, InvariantBasedMaterial):
     dimensional: ClassVar[tuple[str, ...]] = ("a", "bulk")
 
     a: Constant
-    b: Constant
+    b: Constant = option("", above=0.0)
     bulk: Constant | None = None
-    poisson: Constant | None = field(default=None, metadata=OPTIONAL)
+    poisson: Constant | None = option("", default=None, above=-1.0, below=0.5, optional=True)
 
     def check_constants(self) -> None:
-        """Check that the body resists shear and compression, and the exponent."""
-        super().check_constants()
+        """Check that the body resists shear and compression."""
         bulk = float(self.bulk_modulus)
-        check_moduli("a", self.a, bulk, (self.a, self.b, bulk))
-        if not self.b > 0:
-            raise ValueError(f"b = {self.b} must be above 0")
+        check_moduli("a", self.a, bulk, (self.a, bulk))
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         i1, _, j = isochoric_invariants(H)
         half, b, bulk = self.constants
         return half / b * torch.expm1(b * i1) + bulk / 2 * j.square()
@@ -212,6 +205,5 @@ class DemirayK2(BulkOrPoisson, InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
         f1 = c[0] * exp(c[1] * ((1 + m1) * i1 + 3 * m1))
         return isochoric_derivatives(f1, c[1] * f1, 0.0, i1, i2, m1, k2_derivatives(c[2], j))

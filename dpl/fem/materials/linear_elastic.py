@@ -31,7 +31,6 @@ class Hookean(InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
         rest = (c[0] / 2 + c[1]) * i1
         return rest, -c[1] / 2, 0.0, c[0] / 4 + c[1] / 2, 0.0, 0.0, 0.0, 0.0, 0.0
 
@@ -44,7 +43,6 @@ class SaintVenantKirchhoff(YoungPoissonMaterial, Hookean):
     """
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         E = green_lagrange(H)
         return self.lam / 2 * trace(E).square() + self.mu * E.square().sum((-2, -1))
 
@@ -58,16 +56,13 @@ class SmallStrains(Hookean):
     finite: ClassVar[bool] = False
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         strain = (H + H.mT) / 2
         return self.lam / 2 * trace(H).square() + self.mu * strain.square().sum((-2, -1))
 
     def stress(self, H: Tensor) -> Tensor:
-        """Return lambda tr eps I + 2 mu eps, see `Material.stress`."""
         return self.rest_stress(H)
 
     def tangent(self, H: Tensor) -> Tensor:
-        """Return Hooke's moduli, see `Material.tangent`."""
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
         hooke = with_axes(self.lam, 4) * dyad(eye, eye)
         hooke = hooke + 2 * with_axes(self.mu, 4) * symmetric_product(eye)

@@ -17,6 +17,7 @@ from torch import Tensor
 from dpl.fem.identity import identity_of
 from dpl.fem.materials.parameters import CellField, Constant, Parametrised, Scalable
 from dpl.fem.materials.tensors import green_lagrange, trace, with_axes
+from dpl.fem.options import option
 
 
 class Response(NamedTuple):
@@ -265,17 +266,8 @@ class YoungPoissonMaterial(Material, Scalable):
     ranged: ClassVar[tuple[str, ...]] = ("poisson", "young")
     dimensional: ClassVar[tuple[str, ...]] = ("young",)
 
-    poisson: Constant
-    young: Constant = 1.0
-
-    def check_constants(self) -> None:
-        """Check Poisson's ratio and Young's modulus."""
-        if not -1.0 < self.poisson < 0.5:
-            raise ValueError(
-                f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)"
-            )
-        if not 0.0 < self.young < math.inf:
-            raise ValueError(f"young = {self.young} must be above 0")
+    poisson: Constant = option("", above=-1.0, below=0.5)
+    young: Constant = option("", default=1.0, above=0.0)
 
     def identity(self) -> dict[str, Any]:
         """Return class name and parameters; `young` is left out if it is that of the scene."""
@@ -315,14 +307,6 @@ class BulkOrPoisson(Material, Scalable):
             raise ValueError(f"bulk or poisson must be given, and the other be null; {given}")
         super().__post_init__()
 
-    def check_constants(self) -> None:
-        """Check Poisson's ratio."""
-        if self.poisson is not None and not -1.0 < self.poisson < 0.5:
-            raise ValueError(
-                f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)"
-            )
-        super().check_constants()
-
     @property
     def bulk_modulus(self) -> Tensor:
         """Bulk modulus over Young's modulus [-]."""
@@ -350,12 +334,7 @@ def vector_of(*moduli: Tensor) -> Tensor:
 
 
 def check_moduli(name: str, shear: float, bulk: float, constants: Iterable[float]) -> None:
-    """Check the constants of a law, and the moduli at rest that follow.
-
-    Raises:
-        ValueError: A constant is no finite number, or the shear modulus, called `name`, or the bulk
-            modulus is not above 0.
-    """
+    """Check the constants of a law, and the moduli at rest that follow."""
     if not 0 < shear < math.inf:
         raise ValueError(f"{name} = {shear} must be above 0: it is the shear modulus at rest")
     if not 0 < bulk < math.inf:

@@ -25,7 +25,6 @@ class NeoHookeanLn(YoungPoissonMaterial, InvariantBasedMaterial):
     """
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         log_J = torch.log1p(volume_change(H))
         I1_minus_3 = 2 * trace(H) + H.square().sum((-2, -1))
         return self.mu / 2 * (I1_minus_3 - 2 * log_J) + self.lam / 2 * log_J.square()
@@ -39,7 +38,6 @@ class NeoHookeanLn(YoungPoissonMaterial, InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
         rest = c[0] * log_j
         return rest, 0.0, rest - c[1], 0.0, 0.0, 0.0, 0.0, 0.0, c[0]
 
@@ -66,7 +64,6 @@ class NeoHookeanIsoK4(NeoHookeanIsoK2):
     """
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         i1, _, j = isochoric_invariants(H)
         return self.mu / 2 * i1 + self.bulk / 4 * (j * (2 + j) - 2 * torch.log1p(j))
 
@@ -74,7 +71,6 @@ class NeoHookeanIsoK4(NeoHookeanIsoK2):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
         return polynomial_derivatives(c, i1, i2, m1, k4_derivatives(c[4], j))
 
 
@@ -90,7 +86,6 @@ class StableNeoHookean(YoungPoissonMaterial, InvariantBasedMaterial):
     """
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         m, stiffness = self.constants
         i1 = 2 * trace(H) + H.square().sum((-2, -1))
         volume = (volume_change(H) - 3 * m / (4 * stiffness)).square()
@@ -105,7 +100,6 @@ class StableNeoHookean(YoungPoissonMaterial, InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
         near = 1 / (4 + i1)
         J = 1 + j
         volume = c[1] * j * J - 3 / 4 * c[0] * j

@@ -1,15 +1,15 @@
 """Ogden's law, in principal stretches."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from dpl.fem.identity import OPTIONAL
 from dpl.fem.materials.material import BulkOrPoisson, Response, check_moduli
 from dpl.fem.materials.tensors import green_lagrange, volume_change
+from dpl.fem.options import option
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class OgdenK2(BulkOrPoisson):
     shear: Sequence[float]
     exponents: Sequence[float]
     bulk: float | None = None
-    poisson: float | None = field(default=None, metadata=OPTIONAL)
+    poisson: float | None = option("", default=None, above=-1.0, below=0.5, optional=True)
 
     def check_constants(self) -> None:
         """Check that there are as many exponents as moduli, none 0, and that the body resists."""
@@ -42,7 +42,6 @@ class OgdenK2(BulkOrPoisson):
             raise ValueError(
                 f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"
             )
-        super().check_constants()
         bulk = float(self.bulk_modulus)
         constants = [*self.shear, *self.exponents, bulk]
         check_moduli("sum of shear", sum(self.shear), bulk, constants)
@@ -58,7 +57,6 @@ class OgdenK2(BulkOrPoisson):
         return [(mu * self.unit, a) for mu, a in zip(self.shear, self.exponents, strict=True)]
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         j = volume_change(H)
         logs = torch.log1p(2 * _spectrum(green_lagrange(H))[0]) / 2
         logs = logs - torch.log1p(j)[..., None] / 3
@@ -72,7 +70,6 @@ class OgdenK2(BulkOrPoisson):
         return S + H @ S
 
     def response(self, E: Tensor) -> Response:
-        """Return stress and moduli, see `Material.response`."""
         strain, axes = _spectrum(E)
         stress, moduli = self._principal(strain)
         gap = strain[..., :, None] - strain[..., None, :]

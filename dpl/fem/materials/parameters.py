@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.identity import OPTIONAL
 from dpl.fem.mesh.regions import Origin
+from dpl.fem.options import check_options
 from dpl.fem.ranges import ParameterRange, is_range
 from dpl.system.checks import named_errors
 
@@ -26,9 +26,6 @@ class CellField:
         values: Function of the centres of the cells (E, D) [m] that returns the values (E,), the
             values in the order of the cells of the mesh, or the name of such cell data in `file`.
         file: File with this cell data; its cells are those of the mesh.
-
-    Raises:
-        ValueError: There is a name without a file, or a file without a name.
     """
 
     values: Callable[[NDArray[np.float64]], NDArray[np.float64]] | Sequence[float] | str
@@ -42,11 +39,7 @@ class CellField:
             )
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        """Return the values, (E, 1); arguments as in `Material.on`.
-
-        Raises:
-            ValueError: There is not one finite number for each cell.
-        """
+        """Return the values, (E, 1); arguments as in `Material.on`."""
         mesh = basis.mesh
         centres = (mesh.p[:, mesh.t].mean(axis=1).T + origin) * length
         given: Any = self.values
@@ -102,6 +95,7 @@ class Parametrised:
             return
         tensors, ranges = self._tensors, self.parameter_ranges
         if not tensors and not ranges:
+            check_options(self)
             self.check_constants()
             return
         for corner, extreme in product(product(*ranges.values()), (torch.amin, torch.amax)):
@@ -109,10 +103,9 @@ class Parametrised:
             replace(cast("Any", self), **dict(zip(ranges, corner, strict=True)), **numbers)
 
     def check_constants(self) -> None:
-        """Check the constants, which are numbers here: those given, or the ends of ranges.
+        """Raise a ValueError for constants of which no `option` says that they are out of bounds.
 
-        Raises:
-            ValueError: The law does not allow a value.
+        They are numbers here: those given, or the ends of ranges.
         """
 
     def value(self, name: str) -> Tensor:
@@ -159,11 +152,6 @@ class Parametrised:
         return {name: self.unit if name in self.dimensional else None for name in names}
 
     @property
-    def rest_moduli(self) -> Tensor:
-        """Moduli at rest of all cells, a vector (1, M) or (B, M) [-], see `linear_law`."""
-        raise NotImplementedError
-
-    @property
     def _tensors(self) -> dict[str, Tensor]:
         """Constants that are fields or those of a batch."""
         values = {name: getattr(self, name) for name in self.ranged}
@@ -176,9 +164,6 @@ class Parametrised:
             basis: scikit-fem basis of one displacement component.
             length: Length unit of its mesh [m].
             origin: Origin of its mesh in that unit, (D,).
-
-        Raises:
-            ValueError: A field is invalid.
         """
         made = {}
         for name in self.ranged:
@@ -188,11 +173,7 @@ class Parametrised:
         return replace(cast("Any", self), **made) if made else self
 
     def over(self, modulus: float) -> Self:
-        """Return the law with its moduli divided by a modulus in their unit, see `Scalable`.
-
-        Raises:
-            ValueError: The moduli of the law have no unit: they are over E.
-        """
+        """Return the law with its moduli divided by a modulus in their unit, see `Scalable`."""
         raise ValueError(
             f"the moduli of {type(self).__name__} are over Young's modulus; set young [Pa]"
         )
@@ -256,7 +237,7 @@ class Scalable(Parametrised):
         unit: Unit of the moduli over E [-].
     """
 
-    unit: float = field(default=1.0, kw_only=True, metadata=OPTIONAL)
+    unit: float = field(default=1.0, kw_only=True, metadata={"optional": True})
 
     def over(self, modulus: float) -> Self:
         """Return the law with its moduli divided by a modulus in their unit."""
@@ -295,7 +276,6 @@ class Composed(Parametrised):
         return torch.cat([part.expand(*batch, -1) for part in parts], dim=1)
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
-        """Return the law of a body, see `Parametrised.on`."""
         parts = {}
         for key, part in self.parts.items():
             with named_errors(f"{key}."):
@@ -303,7 +283,6 @@ class Composed(Parametrised):
         return self._changed(parts)
 
     def over(self, modulus: float) -> Self:
-        """Return the law with the moduli of all parts divided by one, see `Scalable.over`."""
         return self.with_parts({key: part.over(modulus) for key, part in self.parts.items()})
 
     def of_cells(self, cells: Tensor) -> Self:
@@ -311,7 +290,6 @@ class Composed(Parametrised):
         return self._changed({key: part.of_cells(cells) for key, part in self.parts.items()})
 
     def centred(self) -> Self:
-        """Return the law for one point of each cell, see `Parametrised.centred`."""
         return self._changed({key: part.centred() for key, part in self.parts.items()})
 
     def _changed(self, parts: Mapping[str, Parametrised]) -> Self:

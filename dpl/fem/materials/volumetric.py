@@ -1,6 +1,5 @@
 """Energies of the volume alone: terms of other laws, and matrix of laws of fibres."""
 
-import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,6 +9,7 @@ from torch import Tensor
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.parameters import Constant, Scalable
 from dpl.fem.materials.tensors import volume_change
+from dpl.fem.options import option
 
 
 def k2_derivatives(bulk: Any, j: Any) -> tuple[Any, Any]:
@@ -38,15 +38,9 @@ class VolumetricK2(InvariantBasedMaterial, Scalable):
     ranged: ClassVar[tuple[str, ...]] = ("bulk",)
     dimensional: ClassVar[tuple[str, ...]] = ("bulk",)
 
-    bulk: Constant
-
-    def check_constants(self) -> None:
-        """Check that the body resists compression."""
-        if not 0 < self.bulk < math.inf:
-            raise ValueError(f"bulk = {self.bulk} must be above 0")
+    bulk: Constant = option("", above=0.0)
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         return self.value("bulk") / 2 * volume_change(H).square()
 
     @property
@@ -63,7 +57,6 @@ class VolumetricK2(InvariantBasedMaterial, Scalable):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
         p, pJ = k2_derivatives(c[0], j)
         return p, 0.0, p, 0.0, 0.0, 0.0, 0.0, 0.0, pJ
 
@@ -76,7 +69,6 @@ class VolumetricK4(VolumetricK2):
     """
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         j = volume_change(H)
         return self.value("bulk") / 4 * (j * (2 + j) - 2 * torch.log1p(j))
 
@@ -84,6 +76,5 @@ class VolumetricK4(VolumetricK2):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the derivatives, see `InvariantBasedMaterial.invariant_derivatives`."""
         p, pJ = k4_derivatives(c[0], j)
         return p, 0.0, p, 0.0, 0.0, 0.0, 0.0, 0.0, pJ

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.fem.mesh.finger_mesh import finger
-    from dpl.fem.mesh.generators import box, rectangle
+    from dpl.fem.mesh.generators import box, finger, rectangle
     from dpl.fem.mesh.propeller_mesh import propeller
     from dpl.fem.mesh.reading import read_cell_data, read_mesh
     from dpl.fem.mesh.regions import (

@@ -1,4 +1,4 @@
-"""Structured meshes of boxes and rectangles, and measures of meshes.
+"""Structured meshes of boxes, rectangles and a finger, and measures of meshes.
 
 Meshes are objects of scikit-fem with coordinates in metres.
 """
@@ -10,6 +10,7 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 
+from dpl.fem.mesh.regions import Box, facets_in
 from dpl.system.memory import refuse_mesh
 
 SMALLEST, LARGEST = 1e-12, 1e12  # sides of a body [m]
@@ -26,10 +27,6 @@ def box(size: Sequence[float], nodes: Sequence[int], cell: str = "hexahedron") -
         size: Lengths of the 3 sides [m].
         nodes: Numbers of vertices along the sides, at least 2.
         cell: "hexahedron", or "tetra" for six Kuhn tetrahedra per hexahedron.
-
-    Raises:
-        ValueError: A size or a number of nodes is out of range, or `cell` is unknown.
-        MemoryError: The mesh would not fit in memory.
     """
     kinds = {"hexahedron": skfem.MeshHex, "tetra": skfem.MeshTet}
     return grid(kinds, size, nodes, cell)
@@ -42,13 +39,37 @@ def rectangle(size: Sequence[float], nodes: Sequence[int], cell: str = "quad") -
         size: Lengths of the 2 sides [m].
         nodes: Numbers of vertices along the sides, at least 2.
         cell: "quad", or "triangle" for two triangles per quadrilateral.
-
-    Raises:
-        ValueError: A size or a number of nodes is out of range, or `cell` is unknown.
-        MemoryError: The mesh would not fit in memory.
     """
     kinds = {"quad": skfem.MeshQuad, "triangle": skfem.MeshTri}
     return grid(kinds, size, nodes, cell)
+
+
+def finger(
+    size: Sequence[float] = (0.16, 0.016, 0.016), cells: Sequence[int] = (16, 4, 4)
+) -> skfem.Mesh:
+    """Return a mesh of a pneumatic finger: a box [0, size] with a chamber near its upper side (z).
+
+    One cell is wall on each side of the chamber, and half of the cells are below it. Pressure in
+    the chamber stretches the upper side, so that the finger bends downwards.
+
+    Tag: "chamber" (facets).
+
+    Args:
+        size: Lengths along the finger, across it and upwards [m].
+        cells: Numbers of cells along these sides, at least 3, 3 and 4, the last one even.
+    """
+    if len(cells) != 3 or cells[0] < 3 or cells[1] < 3 or cells[2] < 4 or cells[2] % 2:
+        raise ValueError(f"cells = {list(cells)} must be at least [3, 3, 4], the last one even")
+    inside = math.prod((cells[0] - 3, cells[1] - 3, cells[2] // 2 - 2))  # nodes of the chamber
+    nodes = [n + 1 for n in cells]
+    block = grid({"hexahedron": skfem.MeshHex}, size, nodes, "hexahedron", unused=inside)
+    cell = np.array(size, dtype=np.float64) / cells
+    lower = cell * [1, 1, cells[2] // 2]
+    upper = np.array(size) - cell
+    centres = block.p[:, block.t].mean(axis=1).T
+    is_wall = ~((centres > lower) & (centres < upper)).all(axis=1)
+    mesh = block.restrict(np.flatnonzero(is_wall))
+    return mesh.with_boundaries({"chamber": facets_in(Box(list(lower), list(upper)), mesh)})
 
 
 def grid(

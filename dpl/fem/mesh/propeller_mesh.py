@@ -54,10 +54,6 @@ def propeller(
         thickness: Largest thickness of the sections at root and tip [m].
         cells: Numbers of cells through a blade, on the hub between two blades, through the wall of
             the hub, along the chord (and the hub), and along the blade.
-
-    Raises:
-        ValueError: A number is out of range, or blades would touch or fold.
-        MemoryError: The mesh would not fit in memory.
     """
     lengths = {"bore_diameter": bore_diameter, "hub_diameter": hub_diameter, "diameter": diameter}
     radii, pairs = [d / 2 for d in lengths.values()], {"chord": chord, "thickness": thickness}

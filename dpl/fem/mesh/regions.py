@@ -13,6 +13,8 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 
+from dpl.fem.options import check_options, option
+
 SLACK = 1e-6  # geometric tolerance over the size of the body or of the region
 
 
@@ -59,7 +61,6 @@ class Box:
             raise ValueError(f"lower = {lower} must not be above upper = {upper}")
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return a mask (N,) of the points (N, D) [m] in the region."""
         _check_dimension("lower", self.lower, points)
         slack = SLACK * np.ptp(points, axis=0).max()
         inside = (points >= np.array(self.lower) - slack) & (points <= np.array(self.upper) + slack)
@@ -76,13 +77,13 @@ class Sphere:
     """
 
     centre: Sequence[float]
-    radius: float
+    radius: float = option("m", above=0.0)
 
     def __post_init__(self) -> None:
-        _check_ball(self.centre, self.radius)
+        check_options(self)
+        _check_centre(self.centre)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return a mask (N,) of the points (N, D) [m] in the region."""
         return _in_ball(points, self.centre, self.radius, range(points.shape[1]))
 
 
@@ -99,15 +100,15 @@ class Cylinder:
     """
 
     axis: int
-    radius: float
+    radius: float = option("m", above=0.0)
     centre: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
+        check_options(self)
         _check_axis(self.axis)
-        _check_ball(() if self.centre is None else self.centre, self.radius)
+        _check_centre(() if self.centre is None else self.centre)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return a mask (N,) of the points (N, D) [m] in the region."""
         centre = [0.0] * points.shape[1] if self.centre is None else self.centre
         across = [i for i in range(points.shape[1]) if i != self.axis]
         return _in_ball(points, centre, self.radius, across)
@@ -199,18 +200,10 @@ def nodes_in(
 def facets_in(
     region: Region, mesh: skfem.Mesh, scale: float = 1.0, origin: Origin = 0.0
 ) -> NDArray[np.int_]:
-    """Return the boundary facets in a region in ascending order.
+    """Return the numbers of the boundary facets in a region, ascending.
 
-    Args:
-        region: The region. It contains the facets whose vertices all lie inside. A group contains
-            its facets, or those whose vertices all belong to its cells.
-        mesh: The body.
-        scale: Length unit of the mesh [m].
-        origin: Origin of the mesh in its own unit, (D,).
-
-    Raises:
-        ValueError: The region contains no boundary facet, the group does not exist, or the region
-            does not return a mask (N,).
+    A region contains the facets whose vertices all lie inside. A group contains its facets, or
+    those whose vertices all belong to its cells. For arguments and errors see `nodes_in`.
     """
     region, boundary = _resolved(region), mesh.boundary_facets()
     if not isinstance(region, Tag):
@@ -229,18 +222,10 @@ def facets_in(
 def cells_in(
     region: Region, mesh: skfem.Mesh, scale: float = 1.0, origin: Origin = 0.0
 ) -> NDArray[np.int_]:
-    """Return the cells in a region in ascending order.
+    """Return the numbers of the cells in a region, ascending.
 
-    Args:
-        region: The region. It contains the cells whose centres, the means of the vertices, lie
-            inside. A group contains its cells.
-        mesh: The body.
-        scale: Length unit of the mesh [m].
-        origin: Origin of the mesh in its own unit, (D,).
-
-    Raises:
-        ValueError: The region contains no cell, the group does not exist or is one of facets, or
-            the region does not return a mask (N,).
+    A region contains the cells whose centres, the means of the vertices, lie inside. A group
+    contains its cells; one of facets is an error. For arguments and other errors see `nodes_in`.
     """
     region = _resolved(region)
     if isinstance(region, Tag):
@@ -286,11 +271,9 @@ def _check_axis(axis: int) -> None:
         raise ValueError(f"axis = {axis} must be 0, 1 or 2")
 
 
-def _check_ball(centre: Sequence[float], radius: float) -> None:
+def _check_centre(centre: Sequence[float]) -> None:
     if not all(map(math.isfinite, centre)):
         raise ValueError(f"centre = {list(centre)} must be finite coordinates [m]")
-    if not (math.isfinite(radius) and radius > 0):
-        raise ValueError(f"radius = {radius} must be a positive length [m]")
 
 
 def _check_dimension(name: str, corner: Sequence[float], points: NDArray[np.float64]) -> None:

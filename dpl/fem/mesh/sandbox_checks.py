@@ -32,11 +32,7 @@ class Refused(ValueError):
 
 
 def check_file(path: Path) -> None:
-    """Refuse files that declare entities or list a node number twice, before they are read.
-
-    Raises:
-        Refused: The file is not read.
-    """
+    """Refuse files that declare entities or list a node number twice, before they are read."""
     suffix = path.suffix.lower()
     if suffix in (".vtu", ".xdmf", ".xmf", ".xml"):
         parser = expat.ParserCreate()

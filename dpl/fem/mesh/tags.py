@@ -21,9 +21,6 @@ def add_tags(mesh: skfem.Mesh, raw: meshio.Mesh, kind: str, corners: Numbers) ->
         raw: The content of the file.
         kind: Type of the cells in meshio.
         corners: Node of the file for each vertex of the mesh, (N,).
-
-    Raises:
-        ValueError: A set contains a number that is out of range.
     """
     vertex = np.full(len(raw.points), -1)
     vertex[corners] = np.arange(len(corners))

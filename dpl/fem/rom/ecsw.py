@@ -53,9 +53,6 @@ def cubature(
         states: Displacements, (S, N, D); the memory is C^2 numbers for any S.
         tolerance: Root of the mean square of the relative errors [-], not below 1e-6.
         candidates: Numbers of the cells to choose from, (C,); None: all.
-
-    Raises:
-        ValueError: `tolerance` is not between 0 and 1, or the body has rigid body modes.
     """
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance = {tolerance} must lie between 0 and 1")

@@ -39,9 +39,6 @@ def pod(snapshots: Tensor, rank: int) -> POD:
     Args:
         snapshots: (S, n), of any floating type.
         rank: Number of modes R.
-
-    Raises:
-        ValueError: `rank` is not between 1 and min(S, n), or a snapshot is not finite.
     """
     (count, size), smaller = snapshots.shape, min(snapshots.shape)
     if not 1 <= rank <= smaller:
@@ -53,7 +50,7 @@ def pod(snapshots: Tensor, rank: int) -> POD:
     sketched = smaller > MIN_SKETCH_SIZE and few
     vectors, values = (_sketched if sketched else _exact)(snapshots, rank)
     largest = vectors.gather(0, vectors.abs().argmax(dim=0, keepdim=True))
-    return POD(vectors * largest.sgn().conj(), values)
+    return POD(vectors * largest.sign(), values)
 
 
 def scatter_fields(columns: Tensor, dofs: Tensor) -> Tensor:
@@ -74,17 +71,16 @@ def _exact(snapshots: Tensor, rank: int) -> POD:
     """Return the modes (n, R), of any sign, and all singular values from a Gram matrix."""
     count, size = snapshots.shape
     wide = count <= size
-    dtype = torch.complex128 if snapshots.is_complex() else torch.float64
-    gram = torch.zeros(min(count, size), min(count, size), dtype=dtype)
+    gram = torch.zeros(min(count, size), min(count, size), dtype=torch.float64)
     for part in snapshots.split(CHUNK, dim=1 if wide else 0):
-        part = part.to(dtype)
-        gram.addmm_(part, part.mH) if wide else gram.addmm_(part.mH, part)
+        part = part.double()
+        gram.addmm_(part, part.mT) if wide else gram.addmm_(part.mT, part)
     if not gram.isfinite().all():
         raise ValueError("snapshots are not finite")
     squares, vectors = torch.linalg.eigh(gram)
     vectors = vectors.flip(1)[:, :rank]
     if wide:  # rounding errors of large modes make small ones lose orthogonality
-        parts = [part.to(dtype).mH @ vectors for part in snapshots.split(CHUNK, dim=1)]
+        parts = [part.double().mT @ vectors for part in snapshots.split(CHUNK, dim=1)]
         vectors = torch.linalg.qr(torch.cat(parts))[0]
     return POD(vectors, squares.flip(0).clamp(min=0).sqrt())
 
@@ -93,10 +89,8 @@ def _sketched(snapshots: Tensor, rank: int) -> POD:
     """Return the modes (n, R), of any sign, and leading singular values by a randomised SVD."""
     if not all(part.isfinite().all() for part in snapshots.split(CHUNK)):
         raise ValueError("snapshots are not finite")
-    dtype = torch.complex128 if snapshots.is_complex() else torch.float64
-    low = torch.complex64 if snapshots.is_complex() else torch.float32
-    some = snapshots if snapshots.dtype == dtype else snapshots.to(low)
+    some = snapshots if snapshots.dtype == torch.float64 else snapshots.float()
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(0)
         _, values, vectors = torch.svd_lowrank(some, q=rank + OVERSAMPLING, niter=3)
-    return POD(torch.linalg.qr(vectors[:, :rank].to(dtype))[0], values[:rank].double())
+    return POD(torch.linalg.qr(vectors[:, :rank].double())[0], values[:rank].double())

@@ -4,7 +4,6 @@ Frames have the columns fibre f, sheet s and normal n = f x s. Where a law depen
 sheet may be left out: it is z x f, or x where the fibre lies along z.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from dpl.fem.materials.fibres.reinforced import FibreDirections
 from dpl.fem.mesh.reading import read_cell_data
 from dpl.fem.mesh.regions import Origin, Region, facets_in
 from dpl.fem.mesh.validation import listed
+from dpl.fem.options import check_options, option
 
 PARALLEL = 1e-6  # sine of the angle below which two directions are parallel
 LAPLACE_TOL = 1e-10  # relative residual of Laplace's equation
@@ -37,9 +37,6 @@ class ConstantFibres(FibreDirections):
     Attributes:
         fibre: Direction f of any length, 3 components, or 2 in a 2D body.
         sheet: Direction in the plane of f and s; default: see the module.
-
-    Raises:
-        ValueError: A direction is zero or not finite, or the two are parallel.
     """
 
     fibre: Sequence[float]
@@ -54,7 +51,6 @@ class ConstantFibres(FibreDirections):
         return frames_of(np.array([self.fibre]), sheet)
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        """Return the frame, (1, 3, 3) [-], see `FibreDirections.on`."""
         if len(self.fibre) < basis.mesh.dim():
             raise ValueError(f"fibre = {list(self.fibre)} must have {basis.mesh.dim()} components")
         return self.constant()
@@ -72,7 +68,6 @@ class FibreFunction(FibreDirections):
     function: Callable[[Array], Any]
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        """Return the frames of the points, (E, Q, 3, 3) [-], see `FibreDirections.on`."""
         at = np.asarray(basis.global_coordinates())
         points = (at.reshape(len(at), -1).T + origin) * length
         found = self.function(np.ascontiguousarray(points))
@@ -88,9 +83,6 @@ class FibreData(FibreDirections):
         fibre: Directions f, (E, 3) or (E, 2), or the name of such cell data in `file`.
         sheet: The same for s.
         file: File with this cell data; its cells are those of the mesh.
-
-    Raises:
-        ValueError: There are names without a file, or a file without names.
     """
 
     fibre: str | Sequence[Sequence[float]] | Array
@@ -105,7 +97,6 @@ class FibreData(FibreDirections):
                 )
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        """Return the frames, (E, 3, 3) [-], see `FibreDirections.on`."""
         if self.file is None:
             return _frames_on(basis, self.fibre, self.sheet)
         names = [name for name in (self.fibre, self.sheet) if isinstance(name, str)]
@@ -133,30 +124,20 @@ class LaplaceFibres(FibreDirections):
         inner, outer: Surfaces of the wall.
         longitudinal: Long axis of any length, 3 components; [0, 0, 1] in a 2D body.
         inner_angle, outer_angle: Angles on the surfaces [rad].
-
-    Raises:
-        ValueError: The axis is zero or not finite, or an angle is not finite.
     """
 
     inner: Region
     outer: Region
     longitudinal: Sequence[float]
-    inner_angle: float
-    outer_angle: float
+    inner_angle: float = option("rad")
+    outer_angle: float = option("rad")
 
     def __post_init__(self) -> None:
+        check_options(self)
         _unit_vectors("longitudinal", np.array([self.longitudinal]))
-        for name in ("inner_angle", "outer_angle"):
-            if not math.isfinite(value := getattr(self, name)):
-                raise ValueError(f"{name} = {value} must be a finite number [rad]")
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        """Return the frames of the points, (E, Q, 3, 3) [-], see `FibreDirections.on`.
-
-        Raises:
-            ValueError: A surface contains no boundary facet, the surfaces touch, a part of the body
-                is connected to none of them, or the axis is parallel to t.
-        """
+        """Return the frames of the points, (E, Q, 3, 3) [-], see `FibreDirections.on`."""
         surfaces = [
             facets_in(part, basis.mesh, length, origin) for part in (self.inner, self.outer)
         ]
@@ -181,9 +162,6 @@ def frames_of(fibre: Array, sheet: Array | None = None, *, points: int = 1) -> T
         sheet: Directions s, whose part across f is taken; default: z x f, or x where f
             lies along z.
         points: Rows of each cell, for the message of an error.
-
-    Raises:
-        ValueError: A direction is zero or not finite, or the two are parallel.
     """
     f = _unit_vectors("fibre", fibre, points)
     if sheet is None:

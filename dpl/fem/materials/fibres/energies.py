@@ -16,6 +16,7 @@ from dpl.fem.materials.arithmetic import exp, positive_part, step
 from dpl.fem.materials.linear_elastic import linear_law
 from dpl.fem.materials.material import vector_of
 from dpl.fem.materials.parameters import Constant, Parametrised, Scalable
+from dpl.fem.options import option
 
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))  # rows and columns, in their order
 
@@ -81,17 +82,12 @@ class Guccione(FibreEnergy, Scalable):
     ranged: ClassVar[tuple[str, ...]] = ("c", "bf", "bt", "bfs")
     dimensional: ClassVar[tuple[str, ...]] = ("c",)
 
-    c: Constant
-    bf: Constant
-    bt: Constant
-    bfs: Constant
-
-    def check_constants(self) -> None:
-        for name, value in vars(self).items():
-            check_constant(name, value)
+    c: Constant = option("", above=0.0)
+    bf: Constant = option("", above=0.0)
+    bt: Constant = option("", above=0.0)
+    bfs: Constant = option("", above=0.0)
 
     def energy(self, e: Tensor) -> Tensor:
-        """Return the energy density, see `FibreEnergy.energy`."""
         e11, e22, e33, e12, e23, e13 = components(e)
         along, across = e11.square(), e22.square() + e33.square() + 2 * e23.square()
         shear = 2 * (e12.square() + e13.square())
@@ -136,24 +132,17 @@ class HolzapfelGasserOgdenFibres(FibreEnergy, Scalable):
     ranged: ClassVar[tuple[str, ...]] = ("k1", "k2", "kappa")
     dimensional: ClassVar[tuple[str, ...]] = ("k1",)
 
-    k1: Constant
-    k2: Constant
-    kappa: Constant = 0.0
-    angle: float = 0.0
+    k1: Constant = option("", above=0.0)
+    k2: Constant = option("", above=0.0)
+    kappa: Constant = option("", default=0.0, least=0.0, most=1 / 3)
+    angle: float = option("rad", default=0.0)
     families: int = 2
 
     def check_constants(self) -> None:
-        check_constant("k1", self.k1)
-        check_constant("k2", self.k2)
-        if not 0 <= self.kappa <= 1 / 3:
-            raise ValueError(f"kappa = {self.kappa} must lie between 0 and 1/3")
-        if not math.isfinite(self.angle):
-            raise ValueError(f"angle = {self.angle} must be a finite number [rad]")
         if self.families not in (1, 2):
             raise ValueError(f"families = {self.families} must be 1 or 2")
 
     def energy(self, e: Tensor) -> Tensor:
-        """Return the energy density, see `FibreEnergy.energy`."""
         k1, k2, m11, m22, m33, m12, n12 = self.constants
         e11, e22, e33, e12, _, _ = components(e)
         normal = m11 * e11 + m22 * e22 + m33 * e33
@@ -208,21 +197,14 @@ class HolzapfelOgdenFibres(FibreEnergy, Scalable):
     ranged: ClassVar[tuple[str, ...]] = ("af", "bf", "as_", "bs", "afs", "bfs")
     dimensional: ClassVar[tuple[str, ...]] = ("af", "as_", "afs")
 
-    af: Constant
-    bf: Constant
-    as_: Constant
-    bs: Constant
-    afs: Constant
-    bfs: Constant
-
-    def check_constants(self) -> None:
-        for name in ("af", "bf", "bs", "bfs"):
-            check_constant(name, getattr(self, name))
-        for name in ("as_", "afs"):
-            check_constant(name, getattr(self, name), zero=True)
+    af: Constant = option("", above=0.0)
+    bf: Constant = option("", above=0.0)
+    as_: Constant = option("", least=0.0)
+    bs: Constant = option("", above=0.0)
+    afs: Constant = option("", least=0.0)
+    bfs: Constant = option("", above=0.0)
 
     def energy(self, e: Tensor) -> Tensor:
-        """Return the energy density, see `FibreEnergy.energy`."""
         e11, e22, _, e12, _, _ = components(e)
         af, bf, as_, bs, afs, bfs = self.constants
         fibres = _exponential_energy(af, bf, positive_part(e11))
@@ -253,7 +235,6 @@ class LinearFibres(FibreEnergy):
     moduli: Tensor
 
     def energy(self, e: Tensor) -> Tensor:
-        """Return the energy density, see `FibreEnergy.energy`."""
         S = self.strain_derivatives(self.constants, components(e))[0]
         twice = [1, 1, 1, 2, 2, 2]
         return sum(k / 4 * s * x for k, s, x in zip(twice, S, components(e), strict=True))
@@ -311,10 +292,3 @@ def tension_derivatives(a: Any, b: Any, x: Any) -> tuple[Any, Any]:
 def _exponential_energy(a: Tensor, b: Tensor, x: Tensor) -> Tensor:
     """Return a/(2 b) (exp(b x^2) - 1)."""
     return a / (2 * b) * torch.expm1(b * x.square())
-
-
-def check_constant(name: str, value: float, *, zero: bool = False) -> None:
-    """Raise a ValueError unless a constant of fibres is finite and above 0, or with `zero` 0."""
-    allowed = 0 <= value < math.inf if zero else 0 < value < math.inf
-    if not allowed:
-        raise ValueError(f"{name} = {value} must be {'at least' if zero else 'above'} 0")

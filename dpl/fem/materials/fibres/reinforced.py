@@ -60,9 +60,6 @@ class FibreReinforced(Composed, Material):
         fibres: The energy of the fibres.
         directions: Fibre directions; after `on` the frames (E, Q, 3, 3), (E, 3, 3) or (1, 3, 3)
             [-], columns f, s and n.
-
-    Raises:
-        ValueError: `matrix` is linear, or frames are not orthonormal.
     """
 
     matrix: InvariantBasedMaterial
@@ -104,11 +101,7 @@ class FibreReinforced(Composed, Material):
         return replace(self, **parts)
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
-        """Return the law with the frames of a body; arguments as in `FibreDirections.on`.
-
-        Raises:
-            ValueError: The directions do not fit the body.
-        """
+        """Return the law with the frames of a body; arguments as in `FibreDirections.on`."""
         directions, cells = self.directions, basis.mesh.t.shape[1]
         if not isinstance(directions, Tensor):
             with named_errors("directions: "):
@@ -122,7 +115,6 @@ class FibreReinforced(Composed, Material):
         return replace(super().on(basis, length, origin), directions=directions)
 
     def of_cells(self, cells: Tensor) -> Self:
-        """Return the law at some cells (C,), see `Parametrised.of_cells`."""
         law = super().of_cells(cells)
         if len(self.frames) == 1:
             return law
@@ -150,11 +142,7 @@ class FibreReinforced(Composed, Material):
 
     @property
     def frames(self) -> Tensor:
-        """Fibre frames (E, Q, 3, 3), (E, 3, 3) or (1, 3, 3) [-].
-
-        Raises:
-            ValueError: The directions need a body.
-        """
+        """Fibre frames (E, Q, 3, 3), (E, 3, 3) or (1, 3, 3) [-]."""
         if isinstance(self.directions, Tensor):
             return self.directions
         if (frames := self.directions.constant()) is None:
@@ -165,7 +153,6 @@ class FibreReinforced(Composed, Material):
         return frames
 
     def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
         Q = self._rotation(H)
         return self.matrix.energy(H) + self.fibres.energy(Q.mT @ (2 * green_lagrange(H)) @ Q)
 
@@ -185,12 +172,10 @@ class FibreReinforced(Composed, Material):
         return 2 * self.mu
 
     def response(self, E: Tensor) -> Response:
-        """Return stress and moduli, see `Material.response`."""
         isotropic, fibres = self.matrix.response(E), self._fibre_response(E)
         return Response(isotropic.stress + fibres.stress, isotropic.moduli + fibres.moduli)
 
     def stress(self, H: Tensor) -> Tensor:
-        """Return the first Piola-Kirchhoff stress, see `Material.stress`."""
         Q = self._rotation(H)
         e = components(Q.mT @ (2 * green_lagrange(H)) @ Q)
         local, _ = self.fibres.strain_derivatives(self.fibres.constants, e)
@@ -198,7 +183,6 @@ class FibreReinforced(Composed, Material):
         return self.matrix.stress(H) + S + H @ S
 
     def tangent(self, H: Tensor) -> Tensor:
-        """Return dP/dF, see `Material.tangent`."""
         return self.matrix.tangent(H) + self._fibre_response(green_lagrange(H)).tangent(H)
 
     @property
@@ -224,7 +208,6 @@ class FibreReinforced(Composed, Material):
         return matrix[..., ::4, ::4].sum((-2, -1)), matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
 
     def rest_stress(self, H: Tensor) -> Tensor:
-        """Return the stress of small strains, see `Material.rest_stress`."""
         Q = self._rotation(H)
         strain = Q.mT @ (H + H.mT) @ Q / 2
         D = _moduli(self.fibres.moduli_at_rest).to(H)

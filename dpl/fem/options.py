@@ -1,4 +1,4 @@
-"""Options of load families: numbers and ranges with a unit and bounds."""
+"""Options of laws and load families: numbers and ranges with a unit and bounds."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -15,17 +15,20 @@ class Bounds(NamedTuple):
     least: float
     most: float
     above: float
+    below: float
     nonzero: bool
 
     def contain(self, value: float) -> bool:
         """Return True for a finite number within the bounds."""
-        return self.least <= value <= self.most and self.above < value < math.inf
+        return self.least <= value <= self.most and self.above < value < self.below
 
     def condition(self, value: float | Sequence[float]) -> str | None:
         """Return the condition that a number or a range [low, high] does not meet, in words."""
         is_range = isinstance(value, Sequence)
         ends = [*value] if isinstance(value, Sequence) else [value, value]
         if len(ends) != 2 or not ends[0] <= ends[1] or not all(map(self.contain, ends)):
+            if self.above > -math.inf and self.below < math.inf:
+                return f"lie between {self.above:g} and {self.below:g} (both excluded)"
             words = "a smallest and a largest number" if is_range else "a number"
             words += f" above {self.above:g}" if self.above > -math.inf else ""
             words += f" from {self.least:g}" if self.least > -math.inf else ""
@@ -40,22 +43,27 @@ def option(
     least: float = -math.inf,
     most: float = math.inf,
     above: float = -math.inf,
+    below: float = math.inf,
     nonzero: bool = False,
+    optional: bool = False,
 ) -> Any:
-    """Declare a field of a load family: a number, or a range [low, high] of numbers.
+    """Declare a field of a law or a load family: a number, or a range [low, high] of numbers.
 
-    `RandomLoads` checks that the numbers are finite and in the bounds, and that a range ascends.
-    None is valid and means that the option is left out.
+    `Parametrised` and `RandomLoads` check that the numbers are finite and in the bounds, and that a
+    range ascends. None is valid and means that the option is left out.
 
     Args:
-        unit: SI unit, "times L" for multiples of the longest side, or "" for a pure number.
+        unit: SI unit, "times L" for multiples of the longest side, or "" for a pure number and for
+            moduli in any unit.
         default: Value of the option if it is left out; an option without one must be given.
         least: Least valid number.
         most: Largest valid number.
-        above: Number above which valid numbers lie.
+        above, below: Numbers between which valid numbers lie.
         nonzero: Refuse the range [0, 0].
+        optional: Leave the option out of identities where it has its default.
     """
-    return field(default=default, metadata={"bounds": Bounds(unit, least, most, above, nonzero)})
+    bounds = Bounds(unit, least, most, above, below, nonzero)
+    return field(default=default, metadata={"bounds": bounds, "optional": optional})
 
 
 def check_options(owner: Any) -> None:
