@@ -27,9 +27,8 @@ KEYS = ((Sequence[str], "bodies"), (str, "name"), *COUNTS)
 @command("error_estimates", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Compare the estimates on all bodies, print one table and write rows and a figure."""
-    from benchmarks import error_estimate_figure, error_estimates
+    from benchmarks import error_estimates
     from benchmarks.study import record
-    from dpl.evaluation.tables import write
 
     unknown = set(cfg.bodies) - set(error_estimates.BODIES)
     if unknown or not cfg.bodies:
@@ -38,10 +37,9 @@ def main(cfg: DictConfig) -> None:
     folder = Path(cfg.folder)
     found = list(_of_runs(cfg) if cfg.run else _of_bodies(cfg, folder))
     rows = error_estimates.summarised(found)
-    write(found, folder / f"{cfg.name}_loads.csv")
-    title = "estimated over true error of all answers, 1 thread"
-    record(rows, folder / cfg.name, title, lambda _, path: error_estimate_figure.draw(found, path))
-    error_estimate_figure.conclude(found)
+    record(found, folder / f"{cfg.name}_loads", None, error_estimates.draw)
+    record(rows, folder / cfg.name, "estimated over true error of all answers, 1 thread")
+    error_estimates.conclude(found)
 
 
 def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator["Estimate"]:

@@ -7,6 +7,13 @@ from dpl.system.lazy import public_names
 if TYPE_CHECKING:
     from dpl.visualization.figures import draw_body, error_colours, plot_errors
     from dpl.visualization.shapes import plot_deformed
-    from dpl.visualization.style import COLOURS, DPI, METHOD_COLOURS, STYLE, method_colours
+    from dpl.visualization.style import (
+        COLOURS,
+        DPI,
+        METHOD_COLOURS,
+        OTHER_COLOURS,
+        STYLE,
+        method_colours,
+    )
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -1,6 +1,7 @@
 """Colours and matplotlib parameters of all figures."""
 
 import itertools
+import re
 from collections.abc import Iterable
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -14,8 +15,9 @@ METHOD_COLOURS = {  # a method has the same colour in all figures
     "cnn": COLOURS[3],
     "gnn": COLOURS[4],
     "POD-Galerkin": COLOURS[5],
+    "paper": "#7F3C8D",
 }
-OTHER_COLOURS = ("#7F3C8D", "#A5AA99", "#80BA5A", "#E73F74")  # of methods without an own colour
+OTHER_COLOURS = ("#A5AA99", "#80BA5A", "#E73F74", "#8C564B")  # of methods without an own colour
 
 STYLE = {
     "font.size": 8.5,
@@ -35,6 +37,11 @@ STYLE = {
 
 
 def method_colours(names: Iterable[str]) -> dict[str, str]:
-    """Return the colours of methods by name: those of `METHOD_COLOURS`, else further ones."""
+    """Return the colours of methods by name: those of `METHOD_COLOURS`, else further ones.
+
+    Variants of a method, such as fcnn_plain and "fcnn, hybrid", have its colour.
+    """
     others = itertools.cycle(OTHER_COLOURS)
-    return {name: METHOD_COLOURS.get(name) or next(others) for name in names}
+    methods = {name: re.split(r"[_, ]", name, maxsplit=1)[0] for name in names}
+    own = {one: METHOD_COLOURS.get(one) or next(others) for one in dict.fromkeys(methods.values())}
+    return {name: own[method] for name, method in methods.items()}

@@ -11,7 +11,15 @@ from matplotlib.figure import Figure
 
 from dpl.fem import NeoHookeanLn, Plane, Problem, box, rectangle, surface
 from dpl.fem.postprocess import coarse, triangles
-from dpl.visualization import draw_body, error_colours, plot_deformed, plot_errors
+from dpl.visualization import (
+    METHOD_COLOURS,
+    OTHER_COLOURS,
+    draw_body,
+    error_colours,
+    method_colours,
+    plot_deformed,
+    plot_errors,
+)
 from dpl.visualization.shapes import project
 
 
@@ -164,16 +172,6 @@ def test_nodes_with_larger_errors_are_brighter(make_scene, background):
     assert light[touched].min() > light[~touched].max() + 0.3
 
 
-def test_all_scales_can_be_logarithmic(scene, batch):
-    """Errors of similar size have a linear scale, unless a logarithmic one is requested."""
-    truth = batch.displacement[:1]
-    wrong = [("network", truth + 0.1)]
-    linear = plot_deformed(scene.problem, truth, wrong)
-    logarithmic = plot_deformed(scene.problem, truth, wrong, logarithmic=True)
-    assert linear.axes[-1].get_yscale() == "linear"
-    assert logarithmic.axes[-1].get_yscale() == "log"
-
-
 def test_upright_figures_have_one_row_per_load(make_scene):
     scene = make_scene(n_modes=2)
     truth = 0.01 * torch.randn(3, *scene.problem.shape, dtype=torch.float64)
@@ -184,21 +182,6 @@ def test_upright_figures_have_one_row_per_load(make_scene):
     assert heights["a"] > heights["b"] > heights["c"]
     places = {ax.get_xlabel(): ax.get_position().x0 for ax in panels(figure)}
     assert places["finite elements"] < places["network"] < places["linear"]
-
-
-def test_many_predictions_of_one_load_continue_in_a_second_line(scene, batch):
-    truth = batch.displacement[:1]
-    shown = [(f"network {k}", (1 + 0.1 * k) * truth) for k in range(5)]
-    figure = plot_deformed(scene.problem, truth, shown, upright=True)
-    figure.draw_without_rendering()
-    places = [ax.get_position() for ax in panels(figure)]
-    assert len({round(place.y0, 6) for place in places[:4]}) == 1
-    assert all(place.y1 < places[0].y0 for place in places[4:])
-    assert places[4].x0 == pytest.approx(places[0].x0)
-    texts = [text for ax in figure.axes for text in (ax.xaxis.label, ax.yaxis.label)]
-    boxes = [text.get_window_extent() for text in texts if text.get_text()]
-    assert len(boxes) == 6 + 5
-    assert all(sum(box.overlaps(other) for other in boxes) == 1 for box in boxes)
 
 
 @pytest.mark.parametrize("name", BODIES)
@@ -233,6 +216,19 @@ def test_colours_become_brighter_over_three_decades():
     assert light[0] == light[1] == light[2]
     assert (np.diff(light[2:]) > 20).all()
     assert (error_colours(np.zeros(3)) == error_colours(np.zeros(3))[0]).all()
+
+
+def test_variants_of_a_method_have_its_colour_and_others_have_colours_of_their_own():
+    names = ["fcnn", "fcnn_plain", "pod, hybrid", "Newton to 1e-06", "paper, mse", "mine", "other"]
+    found = method_colours(names)
+    assert found["fcnn"] == found["fcnn_plain"] == METHOD_COLOURS["fcnn"]
+    assert found["pod, hybrid"] == METHOD_COLOURS["pod"]
+    assert found["Newton to 1e-06"] == METHOD_COLOURS["Newton"]
+    assert found["paper, mse"] == METHOD_COLOURS["paper"]
+    assert found["mine"] not in METHOD_COLOURS.values()
+    assert len(set(found.values())) == 6
+    every = [*METHOD_COLOURS.values(), *OTHER_COLOURS]
+    assert len(set(every)) == len(every)
 
 
 def test_errors_are_plotted_against_displacement_and_as_a_distribution():
