@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -98,7 +99,7 @@ def redraw(folder: Path) -> list[Path]:
     for path in sorted(folder.glob("*.csv")):
         for kind, draw in figures():
             try:
-                rows = read(kind, path)
+                rows: list[Any] = read(kind, path)
             except ValueError:  # the columns are those of another class
                 continue
             drawn.append(path.with_suffix(".png"))

@@ -57,7 +57,7 @@ class DeviceTime:
     calls: int  # number of timed calls
     ms: float  # median wall time of a call [ms]
     ms_p99: float  # 99th percentile [ms]
-    loads_per_second: float  # batch * calls_per_second [1/s]
+    loads_per_second: float  # number of loads over the median time [1/s]
     parameters: int  # number of trained parameters
     # peak memory of the device during the calls [MB]; on the processor, of the process
     peak_memory_mb: float

@@ -40,17 +40,6 @@ EXACT = 1e-7  # true error that the tolerance of the solutions decides [-]
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Amount of work for each body."""
-
-    # train, val, test: numbers of loads
-    train: int
-    val: int
-    test: int
-    epochs: int  # epochs of the networks
-
-
-@dataclass(frozen=True)
 class Estimate:
     """True and estimated relative error of an answer of the simulator."""
 
@@ -131,11 +120,9 @@ def _scene(problem: fem.Problem) -> Scene:
     return Scene(problem, fem.ModalLoads(newton.linear_solver, deflection=0.4), newton)
 
 
-def solved_data(scene: Scene, sizes: Sizes, folder: Path) -> DataModule:
+def solved_data(scene: Scene, folder: Path, train: int, val: int, test: int) -> DataModule:
     """Return the data set of a scene in a folder; missing loads are solved."""
-    data = DataModule(
-        scene, folder=str(folder), train=sizes.train, val=sizes.val, test=sizes.test, workers=0
-    )
+    data = DataModule(scene, folder=str(folder), train=train, val=val, test=test, workers=0)
     data.prepare_data()
     return data
 

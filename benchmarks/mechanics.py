@@ -162,10 +162,10 @@ def latency(cfg: DictConfig) -> None:
     """Record the wall times of a trained run."""
     from benchmarks import run_latency
 
-    simulator, folder = Simulator(config.load_run(_run(cfg, "latency"))[1]), Path(cfg.folder)
+    simulator = Simulator(config.load_run(_run(cfg, "latency"))[1])
     load = simulator.scene.loads.sample((0, 2), range(cfg.samples))
     calls = run_latency.call_times(simulator, load, repeats=cfg.repeats)
-    record(calls, folder / "latency", "one load, one thread [ms]")
+    record(calls, Path(cfg.folder) / "latency", "one load, one thread [ms]")
 
 
 def local(cfg: DictConfig) -> None:

@@ -100,10 +100,6 @@ class PODGalerkin:
             snapshots: Displacements in equilibrium, (S, N, D) [-].
             rank: Dimension R of the subspace.
             tolerance: Relative error of their reduced forces [-], see `cubature`.
-
-        Raises:
-            ValueError: `rank` is out of range, see `pod`, or the body has ranges, follower loads or
-                rigid body modes.
         """
         for name, ends in problem.material.parameter_ranges.items():
             raise ValueError(

@@ -148,9 +148,10 @@ def draw(rows: Sequence[Size], path: Path) -> None:
                     ax.loglog(
                         *zip(*known, strict=True), "o-", ms=3.5, lw=1.2, color=colour, label=words
                     )
-            ax.set(ylabel=label, xlabel="degrees of freedom")
-            ax.label_outer()
+            ax.set_ylabel(label)
+            if ax.get_subplotspec().is_last_row():
+                ax.set_xlabel("degrees of freedom")
             low, high = np.log10(ax.get_ylim())
-            ax.set_ylim(top=10 ** (high + 0.17 * len(ax.lines) * (high - low)))  # of the legend
+            ax.set_ylim(top=10 ** (high + 0.12 * len(ax.lines) * (high - low)))  # of the legend
             ax.grid(visible=True)
             ax.legend(loc="upper left")

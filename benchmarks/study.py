@@ -5,7 +5,7 @@ import io
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -38,7 +38,7 @@ def record(
     draw: Draw[Row] | None = None,
     *,
     threads: int = 1,
-    **facts: str | int | None,
+    facts: Mapping[str, str | int | None] = {},  # not changed
 ) -> list[Row]:
     """Write rows as CSV, each as soon as it is measured; print them; write machine and figure.
 
@@ -121,7 +121,7 @@ def dots_legend(figure: Any, filled: str, hollow: str) -> None:
     """Explain the dots of `dots` below a figure."""
     from matplotlib.lines import Line2D
 
-    style = {"color": "0.4", "marker": "o", "ls": "", "ms": 4.5}
+    style: dict[str, Any] = {"color": "0.4", "marker": "o", "ls": "", "ms": 4.5}
     faces = {filled: "0.4", hollow: "white"}
     handles = [Line2D([], [], mfc=face, label=words, **style) for words, face in faces.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=2)

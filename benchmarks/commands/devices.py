@@ -43,6 +43,8 @@ def main(cfg: DictConfig) -> None:
             row for name in names for row in devices.measure(name, scene, samples, clock, *calls)
         )
         stem, facts = Path(cfg.folder) / f"devices_{device.type}", devices.facts(device)
-        rows = record(times, stem, "training steps and predictions", threads=cfg.threads, **facts)
+        rows = record(
+            times, stem, "training steps and predictions", threads=cfg.threads, facts=facts
+        )
     if not rows:
         raise config.ConfigError("networks: none fits into the memory")

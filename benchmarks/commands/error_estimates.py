@@ -47,14 +47,15 @@ def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator["Estimate"]:
     from benchmarks import error_estimates
     from benchmarks.samples import first
 
-    sizes = error_estimates.Sizes(cfg.train, cfg.val, cfg.test, cfg.epochs)
     for body in cfg.bodies:
         start = time.perf_counter()
         scene = error_estimates.BODIES[body]()
         print(*scene.describe()[0], flush=True)
-        data = error_estimates.solved_data(scene, sizes, folder / "data" / body)
-        simulators = error_estimates.trained(scene, data, sizes.epochs)
-        test = first(data.samples("test"), sizes.test)
+        data = error_estimates.solved_data(
+            scene, folder / "data" / body, cfg.train, cfg.val, cfg.test
+        )
+        simulators = error_estimates.trained(scene, data, cfg.epochs)
+        test = first(data.samples("test"), cfg.test)
         more = error_estimates.softened(scene, cfg.softened)
         yield from error_estimates.estimates(body, scene, test, simulators, more)
         print(f"{body}: {time.perf_counter() - start:.0f} s", flush=True)

@@ -285,13 +285,11 @@ def _draw_buckled(path: Path, problem: fem.Problem, straight: Any, branches: Any
             w = [tip[0] for *_, tip in branch.values()]
             loads = np.array([*branch]) * unit
             measured(ax, loads, w, k, f"bent, L/h = {ratio}", linestyle="none")
-        for k, status, how in (
-            *((2, fem.Status.CONVERGED, "from rest, stable"),),
-            *((3, fem.Status.UNSTABLE, "from rest, unstable"),),
-        ):
+        flags = {"stable": fem.Status.CONVERGED, "unstable": fem.Status.UNSTABLE}
+        for k, (how, status) in enumerate(flags.items(), 2):
             loads = np.array([P for P, answer in straight.items() if answer.status == status])
             style = {"marker": "x", "markersize": 5} if k == 3 else {}
-            measured(ax, loads * unit, 0 * loads, k, how, linestyle="none", **style)
+            measured(ax, loads * unit, 0 * loads, k, f"from rest, {how}", linestyle="none", **style)
         ax.set(xlim=(0.15, 2.05), ylim=(-0.05, 0.88), xticks=[0.5, 1, 1.5, 2])
         ax.legend(loc="upper left", bbox_to_anchor=(-0.02, 1.02))
         ax = panel(figure, 2, "z/L [-]", "x/L [-]", "(b)", aspect="equal")
