@@ -29,16 +29,11 @@ STRESSES = {"R^T dP": 0, "dP": 1}  # position in the features
 
 @dataclass(frozen=True)
 class Variant:
-    """A variant of the model.
+    """A variant of the model."""
 
-    Attributes:
-        name: Its name.
-        options: Arguments of `Unrolled` that differ.
-        change: Returns a context in which the variant is fitted and evaluated.
-    """
-
-    name: str
-    options: Mapping[str, Any] = field(default_factory=dict)
+    name: str  # its name
+    options: Mapping[str, Any] = field(default_factory=dict)  # arguments of `Unrolled` that differ
+    # returns a context in which the variant is fitted and evaluated
     change: Callable[[], AbstractContextManager[Any]] = nullcontext
 
     @property
@@ -52,49 +47,32 @@ WHOLE = Variant("all")
 
 @dataclass(frozen=True)
 class Row:
-    """Errors of one variant on one set of loads.
+    """Errors of one variant on one set of loads."""
 
-    Attributes:
-        part: "learning curve", "ablation" or "other loads".
-        variant: Name of the variant or of the set of loads.
-        samples: Number of loads that it was fitted to.
-        count: Number of loads on which the errors were measured.
-        e_mean, e_max, SNR_min, rel_L2_median, rel_L2_worst: See `dpl.training.metrics`.
-        e_mean_corrected: e_mean after one step of Newton's method in the modes.
-        rel_L2_worst_corrected: Largest relative error after this step.
-        fit_seconds: Wall time of the fit on one thread [s].
-        modes: Number of modes that the fit chose.
-        data_seconds: Wall time in which the loads of the fit were solved [s]; None if not recorded.
-    """
-
-    part: str
-    variant: str
-    samples: int
-    count: int
+    part: str  # "learning curve", "ablation" or "other loads"
+    variant: str  # name of the variant or of the set of loads
+    samples: int  # number of loads that it was fitted to
+    count: int  # number of loads on which the errors were measured
+    # e_mean, e_max, SNR_min, rel_L2_median, rel_L2_worst: See `dpl.training.metrics`
     e_mean: float
     e_max: float
     SNR_min: float
     rel_L2_median: float
     rel_L2_worst: float
-    e_mean_corrected: float
-    rel_L2_worst_corrected: float
-    fit_seconds: float
-    modes: int
+    e_mean_corrected: float  # e_mean after one step of Newton's method in the modes
+    rel_L2_worst_corrected: float  # largest relative error after this step
+    fit_seconds: float  # wall time of the fit on one thread [s]
+    modes: int  # number of modes that the fit chose
+    # wall time in which the loads of the fit were solved [s]; None if not recorded
     data_seconds: float | None = None
 
 
 def variants(options: Mapping[str, Sequence[Any]]) -> list[Variant]:
-    """Return the variants of the ablation.
-
-    Args:
-        options: Values of arguments of `Unrolled` that are tried, one variant each.
-    """
+    """Return the variants of the ablation."""
     fixed = [
         WHOLE,
         Variant("without symmetry", {"symmetry": False}),
-        Variant("H^T H / 2 in first map", change=quadratic_first_feature),
         *(Variant(f"{name} only", change=_OneStress(k)) for name, k in STRESSES.items()),
-        Variant("float64, not rounded", change=without_rounding),
     ]
     sizes = [
         Variant(f"{name} = {value}", {name: value})
@@ -102,16 +80,6 @@ def variants(options: Mapping[str, Sequence[Any]]) -> list[Variant]:
         for value in values
     ]
     return fixed + sizes
-
-
-def quadratic_first_feature() -> AbstractContextManager[Any]:
-    """Return a context in which the first map takes H^T H / 2 instead of the rotated strain."""
-
-    def first_features(cells: SampleCells, linear: Tensor) -> Tensor:
-        D = cells.gradients.shape[-1]
-        return (linear.mT @ linear / 2)[:, :, None, :D, :D]
-
-    return mock.patch.object(SampleCells, "first_features", first_features)
 
 
 @dataclass(frozen=True)
@@ -132,11 +100,6 @@ class _OneStress:
         return mock.patch.object(SampleCells, "features", features)
 
 
-def without_rounding() -> AbstractContextManager[Any]:
-    """Return a context in which modes, gradients and maps remain float64."""
-    return mock.patch.object(torch.Tensor, "float", lambda tensor: tensor)
-
-
 def curve(
     build: Build, samples: Sample, held_out: Sample, test: Sample, counts: Sequence[int]
 ) -> Iterator[Row]:
@@ -148,14 +111,7 @@ def curve(
 def fitted(
     variant: Variant, build: Build, samples: Sample, held_out: Sample, test: Sample, part: str
 ) -> tuple[Row, Unrolled]:
-    """Fit a variant; return its row and the model.
-
-    Args:
-        variant: The variant.
-        build: Returns a model of arguments of `Unrolled`.
-        samples, held_out, test: Samples to fit to, to choose by, and for the errors.
-        part: See `Row`.
-    """
+    """Fit a variant; return its row and the model."""
     # compiled loops have features and precision of their own, which no variant changes
     without_loops = mock.patch.object(Unrolled, "_is_compiled", return_value=False)
     with variant.change(), without_loops, one_thread():
@@ -169,14 +125,7 @@ def fitted(
 
 
 def other_loads(net: Unrolled, row: Row, test: Sample, count: int) -> Iterator[Row]:
-    """Yield the errors of a fitted model on loads of other sizes and on small areas.
-
-    Args:
-        net: The model.
-        row: Its row in the ablation.
-        test: Loads in range.
-        count: Number of loads of each set.
-    """
+    """Yield the errors of a fitted model on loads of other sizes and on small areas."""
     scene, stream = net.scene, (0, OTHER_STREAM)
     sets = paper_tables.load_sets(scene, test, count)
     found = {title: sets[name] for name, title in OTHER_SETS.items()}

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.ablation import ABLATION, CURVE, Row
-from benchmarks.study import METHOD_COLOURS, picture
+from benchmarks.study import METHOD_COLOURS, dots, dots_legend, picture
 from dpl import Sample
 from dpl.models import Unrolled
 from dpl.visualization import COLOURS, draw_body
@@ -19,79 +19,68 @@ COLOUR = METHOD_COLOURS["unrolled"]
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Draw the learning curve over loads and over minutes, and the errors of the ablation."""
     learnt = [row for row in rows if row.part == CURVE]
-    with picture(path, 11, 3.6) as figure:
-        over_loads, over_minutes, variants = figure.subplots(1, 3, width_ratios=(1, 1, 1.2))
-        _draw_curve(over_loads, [row.samples for row in learnt], learnt)
-        over_loads.set_xlabel("loads that are solved")
+    left_out = [row for row in rows if row.part == ABLATION]
+    with picture(path, 5.6) as figure:
+        axes = figure.subplot_mosaic([["loads", "minutes"], ["variants", "variants"]])
+        _draw_curve(axes["loads"], [row.samples for row in learnt], learnt)
+        axes["loads"].set_xlabel("loads that are solved")
         solved = [row.data_seconds for row in learnt if row.data_seconds is not None]
         if len(solved) == len(learnt):
             pairs = zip(solved, learnt, strict=True)
             minutes = [(seconds + row.fit_seconds) / 60 for seconds, row in pairs]
-            _draw_curve(over_minutes, minutes, learnt)
-            over_minutes.set_xlabel("data and fit [min]")
+            _draw_curve(axes["minutes"], minutes, learnt)
+            axes["minutes"].set_xlabel("data and fit [min]")
         else:
-            over_minutes.remove()
-        _draw_variants(variants, [row for row in rows if row.part == ABLATION])
+            axes["minutes"].remove()
+        ax, errors = axes["variants"], [row.e_mean for row in left_out]
+        corrected = [row.e_mean_corrected for row in left_out]
+        dots(ax, [row.variant for row in left_out], errors, corrected, [COLOUR] * len(errors))
+        ax.set(xscale="log", xlabel="$e_{mean}$")
+        _set_ticks(ax.xaxis, "{x:.0e}")
+        ax.set_title(f"ablation, {left_out[0].samples} loads" if left_out else "", loc="left")
+        dots_legend(figure, "prediction", "after one step in the modes")
 
 
 def _draw_curve(ax: Any, x: Sequence[float], rows: Sequence[Row]) -> None:
+    ax.loglog(x, [row.e_mean for row in rows], "o-", color=COLOUR, ms=4)
+    corrected = [row.e_mean_corrected for row in rows]
+    ax.loglog(x, corrected, "o--", color=COLOUR, mfc="white", ms=4)
+    ax.set_ylabel("$e_{mean}$")
+    _set_ticks(ax.xaxis, "{x:g}")
+    _set_ticks(ax.yaxis, "{x:.0e}")
+    ax.grid(visible=True)
+
+
+def _set_ticks(axis: Any, form: str) -> None:
+    """Put labelled ticks at 1, 2 and 5 of each decade."""
     from matplotlib.ticker import LogLocator
 
-    ax.loglog(x, [row.e_mean for row in rows], "o-", color=COLOUR, ms=4, label="prediction")
-    corrected = [row.e_mean_corrected for row in rows]
-    ax.loglog(x, corrected, "s--", color=COLOUR, mfc="white", ms=4, label="after one step")
-    ax.set_ylabel("$e_{mean}$")
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.set_minor_formatter("")  # labels of minor ticks would overlap
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_major_formatter("{x:.0e}")
-    ax.grid(which="both")
-    ax.legend(loc="upper right")
-
-
-def _draw_variants(ax: Any, rows: Sequence[Row]) -> None:
-    names = [row.variant for row in rows]
-    ax.plot([row.e_mean for row in rows], names, "o", color=COLOUR, ms=5, label="prediction")
-    corrected = [row.e_mean_corrected for row in rows]
-    ax.plot(corrected, names, "s", color=COLOUR, mfc="white", ms=4, label="after one step")
-    ax.set_xscale("log")
-    ax.xaxis.set_minor_formatter("")  # labels of minor ticks would overlap
-    ax.invert_yaxis()
-    ax.grid(which="both")
-    ax.set_xlabel("$e_{mean}$")
-    if rows:
-        ax.set_title(f"ablation, {rows[0].samples} loads", loc="left")
-    ax.legend()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(form)
+    axis.set_minor_formatter("")
 
 
 def draw_method(net: Unrolled, test: Sample, path: Path) -> None:
-    """Draw the steps of a prediction for the test load with the largest displacement.
-
-    Args:
-        net: The fitted model.
-        test: Solved loads.
-        path: Of the picture.
-    """
+    """Draw the steps of a prediction for the test load with the largest displacement."""
     panels = _panels(net, test)
     shapes = [panel.displacement for panel in panels if panel.displacement is not None]
     problem = net.scene.problem
     kind = {"projection": "3d"} if problem.shape[1] == 3 else {}
-    with picture(path, 13, 2.1) as figure:
+    with picture(path, 3.7) as figure:
         figure.set_layout_engine("none")
-        figure.subplots_adjust(0.01, 0.0, 0.99, 0.8, wspace=0.12)
-        axes = figure.subplots(1, len(panels), subplot_kw=kind)
-        for ax, panel in zip(axes, panels, strict=True):
+        room = {"left": 0.01, "bottom": -0.02, "right": 0.99, "top": 0.88}
+        axes = figure.subplots(2, 3, subplot_kw=kind, gridspec_kw={**room, "hspace": 0.3})
+        for k, (ax, panel) in enumerate(zip(axes.flat, panels, strict=True)):
             draw_body(
                 ax, problem, panel.displacement, values=panel.values, colours="YlOrRd", fit=shapes
             )
-            ax.set_title(panel.title)
+            if kind:
+                sides = ax.get_xlim(), ax.get_ylim(), ax.get_zlim()
+                ax.set_box_aspect([high - low for low, high in sides], zoom=1.7)
+            ax.set_title(f"{k + 1}. {panel.title}")
             if panel.points is not None:
                 ax.computed_zorder = False  # of axes in 3D: the points lie inside the body
                 ax.scatter(*panel.points.T.numpy(), s=3, color=COLOURS[1], zorder=3)
-        for k in range(1, len(panels)):
-            place = k / len(panels), 0.35
-            figure.text(*place, "\N{RIGHTWARDS ARROW}", fontsize=20, ha="center", color="0.3")
 
 
 class _Panel(NamedTuple):

@@ -15,9 +15,6 @@ def name(libraries: Sequence[str]) -> str | None:
 
     Netlib's reference BLAS is named wherever it is loaded, whatever else is. Debian gives every
     BLAS the file name `libblas.so.3`; the folder tells them apart.
-
-    Args:
-        libraries: Paths, as in `/proc/self/maps`.
     """
     found = set()
     for library in libraries:
@@ -30,10 +27,6 @@ def name(libraries: Sequence[str]) -> str | None:
 
 
 def optimised(pattern: str = FOLDERS) -> str | None:
-    """Return a folder whose `libblas.so.3` is OpenBLAS, for `LD_LIBRARY_PATH`; None without one.
-
-    Args:
-        pattern: Absolute pattern of the files that are looked for.
-    """
+    """Return a folder whose `libblas.so.3` is OpenBLAS, for `LD_LIBRARY_PATH`; None without one."""
     found = sorted(Path("/").glob(pattern.lstrip("/")))
     return str(found[0].parent) if found else None

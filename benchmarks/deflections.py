@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import numpy as np
 
@@ -15,34 +14,19 @@ from dpl.data.solving.worker_pool import solve_loads
 from dpl.data.storage.manifest import STREAMS
 
 BINS = 20
-AT_LINE: dict[str, Any] = {
-    "xycoords": ("data", "axes fraction"), "textcoords": "offset points"
-}  # of the label of the median  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Deflection:
-    """Deflection of a body under a test load.
+    """Deflection of a body under a test load."""
 
-    Attributes:
-        body: Name of the body.
-        load: Number of the load in the test stream.
-        deflection: Largest nodal displacement over L, the longest side of the body [-].
-    """
-
-    body: str
-    load: int
-    deflection: float
+    body: str  # name of the body
+    load: int  # number of the load in the test stream
+    deflection: float  # largest nodal displacement over L, the longest side of the body [-]
 
 
 def deflections(scenes: Mapping[str, Scene], count: int, workers: int) -> list[Deflection]:
-    """Return the deflection of each test load that a data set of seed 0 accepts.
-
-    Args:
-        scenes: Scenes by name.
-        count: Number of test loads of each scene.
-        workers: Number of worker processes.
-    """
+    """Return the deflection of each test load that a data set of seed 0 accepts."""
     rows = []
     for name, scene in scenes.items():
         jobs = [LoadKey((0, STREAMS["test"]), k) for k in range(count)]
@@ -60,24 +44,18 @@ def by_body(rows: Sequence[Deflection]) -> dict[str, list[float]]:
     return {name: [row.deflection for row in rows if row.body == name] for name in names}
 
 
-def draw(rows: Sequence[Deflection], file: Path) -> None:
-    """Draw a histogram of the deflections of each body, with the median.
-
-    Args:
-        rows: Deflections of one body or several.
-        file: Of the picture.
-    """
+def draw(rows: Sequence[Deflection], path: Path) -> None:
+    """Draw a histogram of the deflections of each body, with the median."""
     bodies = by_body(rows)
-    with picture(file, 3.6 * len(bodies), 2.7) as figure:
+    with picture(path, 2.7) as figure:
         axes = figure.subplots(1, len(bodies), squeeze=False)[0]
         for ax, (name, values) in zip(axes, bodies.items(), strict=True):
             top, middle = max(values), median(values)
             ax.hist(values, bins=BINS, range=(0, top), color="0.6", edgecolor="white", lw=0.5)
-            ax.axvline(middle, color="black", lw=1)
-            ax.annotate(f"median {middle:.3f} L", (middle, 1), (4, -8), **AT_LINE)
+            ax.axvline(middle, color="black", lw=1, label=f"median {middle:.3f} L")
             ax.set_title(f"{name}: {len(values)} test loads, largest {top:.3f} L", loc="left")
             ax.set_xlabel("largest nodal displacement / L [-]")
             ax.set_xlim(0, 1.05 * top)
-            ax.set_ylim(0, 1.15 * ax.get_ylim()[1])
             ax.yaxis.get_major_locator().set_params(integer=True)
+            ax.legend(loc="upper right")
         axes[0].set_ylabel("loads")

@@ -46,52 +46,31 @@ OUT_OF_MEMORY = (MemoryError, torch.OutOfMemoryError)
 
 @dataclass(frozen=True)
 class DeviceTime:
-    """Wall time of one call on a device.
+    """Wall time of one call on a device."""
 
-    Attributes:
-        network: Name of the network in `NETWORKS`.
-        device: "cpu" or "cuda".
-        task: "training step" (forward pass, loss, backward pass and optimiser), "prediction"
-            (inputs and result on the device) or "prediction with copies" (both on the host).
-        batch: Number of loads of a call.
-        calls: Number of timed calls.
-        ms: Median wall time of a call [ms].
-        ms_p99: 99th percentile [ms].
-        calls_per_second: 1000 / ms [1/s].
-        loads_per_second: batch * calls_per_second [1/s].
-        parameters: Number of trained parameters.
-        peak_memory_mb: Peak memory of the device during the calls [MB]; on the processor, of the
-            process.
-    """
-
-    network: str
-    device: str
+    network: str  # name of the network in `NETWORKS`
+    device: str  # "cpu" or "cuda"
+    # "training step" (forward pass, loss, backward pass and optimiser), "prediction" (inputs and
+    # result on the device) or "prediction with copies" (both on the host)
     task: str
-    batch: int
-    calls: int
-    ms: float
-    ms_p99: float
-    calls_per_second: float
-    loads_per_second: float
-    parameters: int
+    batch: int  # number of loads of a call
+    calls: int  # number of timed calls
+    ms: float  # median wall time of a call [ms]
+    ms_p99: float  # 99th percentile [ms]
+    loads_per_second: float  # number of loads over the median time [1/s]
+    parameters: int  # number of trained parameters
+    # peak memory of the device during the calls [MB]; on the processor, of the process
     peak_memory_mb: float
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Repetition of calls until a number of calls or a time is reached.
+    """Repetition of calls until a number of calls or a time is reached."""
 
-    Attributes:
-        device: The device that is waited for.
-        repeats: Largest number of timed calls.
-        seconds: Time after which no further call begins [s].
-        warm_up: Number of calls before, which are not timed.
-    """
-
-    device: torch.device
-    repeats: int
-    seconds: float
-    warm_up: int = 3
+    device: torch.device  # the device that is waited for
+    repeats: int  # largest number of timed calls
+    seconds: float  # time after which no further call begins [s]
+    warm_up: int = 3  # number of calls before, which are not timed
 
     def times(self, call: Callable[[], object]) -> tuple[list[float], float]:
         """Return the wall times of a call [ms], at least one, and the peak memory [MB]."""
@@ -132,21 +111,6 @@ class Clock:
         return kilobytes * 1024 / 1e6
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Sizes of the measurement.
-
-    Attributes:
-        batches: Numbers of loads of a training step.
-        predictions: Numbers of loads of a prediction.
-        clock: Device and number of repetitions.
-    """
-
-    batches: Sequence[int]
-    predictions: Sequence[int]
-    clock: Clock
-
-
 def samples_of(scene: Scene, count: int = LOADS) -> Sample:
     """Return loads with artificial displacements of the size of linear solutions, on the CPU."""
     load = scene.loads.sample((0, 0), range(count))
@@ -158,39 +122,43 @@ def samples_of(scene: Scene, count: int = LOADS) -> Sample:
     return Sample(load.force, bent, load.young, load.parameters)
 
 
-def measure(name: str, scene: Scene, samples: Sample, plan: Plan) -> Iterator[DeviceTime | str]:
-    """Yield the times of a network, and a line of text for each task without enough memory.
-
-    Args:
-        name: Name of the network in `NETWORKS`.
-        scene: The scene.
-        samples: Samples on the CPU.
-        plan: Sizes of the measurement.
-    """
+def measure(
+    name: str,
+    scene: Scene,
+    samples: Sample,
+    clock: Clock,
+    batches: Sequence[int],
+    predictions: Sequence[int],
+) -> Iterator[DeviceTime]:
+    """Yield the times of a network; print a line for each task without enough memory."""
     try:
         surrogate = fitted(name, scene, samples)
         dataset = surrogate.encode(samples)
-        surrogate.to(plan.clock.device)
+        surrogate.to(clock.device)
     except OUT_OF_MEMORY as error:
-        yield f"{name}: {first_line(error)}"
+        print(f"left out: {name}: {first_line(error)}", flush=True)
         return
     tasks: list[tuple[str, int, Callable[[], Callable[[], object]]]] = [
         (task, batch, partial(prediction, surrogate, samples, batch, copies=task == COPIED))
-        for batch in plan.predictions
+        for batch in predictions
         for task in (RESIDENT, COPIED)
     ]
     if name != FIT:
-        for batch in plan.batches:
+        for batch in batches:
             tasks.append((TRAINING, batch, partial(training_step, surrogate, dataset, batch)))
+    parameters = sum(weights.numel() for weights in surrogate.net.parameters())
     for task, batch, build in tasks:
         try:
-            times, peak = plan.clock.times(build())
+            times, peak = clock.times(build())
         except OUT_OF_MEMORY as error:
-            yield f"{name}, {task}, batch {batch}: {first_line(error)}"
+            print(f"left out: {name}, {task}, batch {batch}: {first_line(error)}", flush=True)
         else:
-            yield _row((name, plan.clock.device.type, task, batch), times, surrogate.net, peak)
+            ms, last = percentiles(torch.tensor(times, dtype=torch.float64))
+            print(f"{name}, {task}, batch {batch}: {ms:.3g} ms, {peak:,.0f} MB", flush=True)
+            key = name, clock.device.type, task, batch
+            yield DeviceTime(*key, len(times), ms, last, 1e3 * batch / ms, parameters, peak)
         surrogate.zero_grad(set_to_none=True)
-        if plan.clock.device.type == "cuda":
+        if clock.device.type == "cuda":
             gc.collect()
             torch.cuda.empty_cache()
 
@@ -207,13 +175,7 @@ def fitted(name: str, scene: Scene, samples: Sample) -> Surrogate:
 
 
 def training_step(surrogate: Surrogate, dataset: Any, batch: int) -> Callable[[], float]:
-    """Return a call that makes one optimiser step with a batch and returns its loss.
-
-    Args:
-        surrogate: The surrogate, on its device.
-        dataset: Samples as `Surrogate.encode` returns them, on the CPU.
-        batch: Number of loads; samples are repeated if there are fewer.
-    """
+    """Return a call that makes one optimiser step with a batch and returns its loss."""
     indices = [k % len(dataset) for k in range(batch)]
     inputs = move_data_to_device(dataset.__getitems__(indices), surrogate.device)
     surrogate.train()
@@ -235,14 +197,7 @@ def training_step(surrogate: Surrogate, dataset: Any, batch: int) -> Callable[[]
 def prediction(
     surrogate: Surrogate, samples: Sample, batch: int, *, copies: bool
 ) -> Callable[[], torch.Tensor]:
-    """Return a call that predicts a batch.
-
-    Args:
-        surrogate: The surrogate, on its device.
-        samples: Samples on the CPU; they are repeated if there are fewer than `batch`.
-        batch: Number of loads.
-        copies: Copy the loads from the host and the displacements back in each call.
-    """
+    """Return a call that predicts a batch."""
     indices = torch.arange(batch) % len(samples.force)
     host = Load(*(column[indices] for column in samples.load))
     device = surrogate.device
@@ -267,17 +222,29 @@ def _moved(load: Load, device: torch.device) -> Load:
     return Load(*(column.to(device) for column in load))
 
 
-def _row(
-    key: tuple[str, str, str, int], times: Sequence[float], net: nn.Module, peak: float
-) -> DeviceTime:
-    median, last = percentiles(torch.tensor(times, dtype=torch.float64))
-    return DeviceTime(
-        *key,
-        calls=len(times),
-        ms=median,
-        ms_p99=last,
-        calls_per_second=1e3 / median,
-        loads_per_second=1e3 * key[3] / median,
-        parameters=sum(weights.numel() for weights in net.parameters()),
-        peak_memory_mb=peak,
-    )
+def select_device(choice: str) -> torch.device:
+    """Return the device of "cpu", "cuda" (the first GPU) or "auto" (a GPU if there is one)."""
+    if choice not in ("auto", "cpu", "cuda"):
+        raise ValueError(f"device = {choice} must be auto, cpu or cuda")
+    found = torch.cuda.is_available()
+    if choice == "cuda" and not found:
+        build = torch.version.cuda or "a build without CUDA"
+        raise ValueError(
+            f"device = cuda needs a GPU that PyTorch {torch.__version__} ({build}) can use; "
+            "take device=cpu"
+        )
+    return torch.device("cuda" if found and choice != "cpu" else "cpu")
+
+
+def facts(device: torch.device) -> dict[str, str | int | None]:
+    """Return the names of the device and of the software that it runs."""
+    found: dict[str, str | int | None] = {"torch": torch.__version__, "device": device.type}
+    if device.type == "cuda":
+        found |= {
+            "gpu": torch.cuda.get_device_name(device),
+            "gpu_memory_gb": round(torch.cuda.get_device_properties(device).total_memory / 1e9),
+            "cuda": torch.version.cuda,
+            "tf32_convolutions": str(torch.backends.cudnn.allow_tf32),
+            "tf32_products": str(torch.backends.cuda.matmul.allow_tf32),
+        }
+    return found

@@ -13,22 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks import peers
 from benchmarks.samples import solved
-from dpl import Sample, Scene
+from benchmarks.study import OTHER_COLOURS, picture
+from dpl import Sample, Scene, fem
 from dpl.data import DataModule
-from dpl.fem import (
-    Load,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SubspaceNewton,
-    Tag,
-    box,
-    propeller,
-    solve,
-)
 from dpl.inference import Simulator
 from dpl.models import FCNN, PODNet, Unrolled
 from dpl.training import MSE, Muon, RMSELoss, Surrogate, fit
@@ -45,123 +34,94 @@ MODES = 60  # of the correction of `pod`
 SHARES = (0.05, 0.5, 0.95)  # quantiles of the ratio
 SAID = 0.1  # estimated error below which an answer must not be too good [-]
 LEAST = 1 / 3  # ratio of estimated and true error below which it is [-]
+LOAD_COLOURS = ("0.25", *OTHER_COLOURS)  # no loads have the colour of a method
 EXACT = 1e-7  # true error that the tolerance of the solutions decides [-]
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Amount of work for each body.
-
-    Attributes:
-        train, val, test: Numbers of loads.
-        epochs: Epochs of the networks.
-    """
-
-    train: int
-    val: int
-    test: int
-    epochs: int
-
-
-@dataclass(frozen=True)
 class Estimate:
-    """True and estimated relative error of an answer of the simulator.
+    """True and estimated relative error of an answer of the simulator."""
 
-    Attributes:
-        body, prediction, loads, call: Names of the body, the model, the set of loads and the call.
-        method: Method that computed the answer.
-        error: ||u - v|| / ||v|| with the solution v [-].
-        estimated: `error` of the answer [-].
-    """
-
+    # body, prediction, loads, call: names of the body, the model, the set of loads and the call
     body: str
     prediction: str
     loads: str
     call: str
-    method: str
-    error: float
-    estimated: float
+    method: str  # method that computed the answer
+    error: float  # ||u - v|| / ||v|| with the solution v [-]
+    estimated: float  # `error` of the answer [-]
 
 
 @dataclass(frozen=True)
 class Row:
-    """Distribution of the ratio of estimated and true error over the answers of a group.
+    """Distribution of the ratio of estimated and true error over the answers of a group."""
 
-    Attributes:
-        body, prediction, loads: See `Estimate`.
-        count: Number of answers.
-        unknown: Number of answers with an infinite estimate, which the quantiles leave out.
-        error: Median of the true relative error [-].
-        p5, median, p95: Quantiles of the ratio [-].
-        least: Smallest ratio of an answer whose estimate is below `SAID` [-]; NaN without any.
-        missed: Number of these answers whose ratio is below `LEAST`.
-    """
-
+    # body, prediction, loads: See `Estimate`
     body: str
     prediction: str
     loads: str
-    count: int
-    unknown: int
-    error: float
+    count: int  # number of answers
+    unknown: int  # number of answers with an infinite estimate, which the quantiles leave out
+    error: float  # median of the true relative error [-]
+    # p5, median, p95: quantiles of the ratio [-]
     p5: float
     median: float
     p95: float
-    least: float
-    missed: int
+    least: float  # smallest ratio of an answer whose estimate is below `SAID` [-]; NaN without any
+    missed: int  # number of these answers whose ratio is below `LEAST`
 
 
 def beam() -> Scene:
     """Return the default beam."""
-    return _scene(Problem.build(box([100.0, 25.0, 25.0], [17, 5, 5]), NeoHookeanLn(0.3), fixed=END))
+    return _scene(
+        fem.Problem.build(
+            fem.box([100.0, 25.0, 25.0], [17, 5, 5]), fem.NeoHookeanLn(0.3), fixed=END
+        )
+    )
 
 
 def column() -> Scene:
     """Return a column, ten times as long as thick."""
-    return _scene(Problem.build(box([100.0, 10.0, 10.0], [25, 4, 4]), NeoHookeanLn(0.3), fixed=END))
-
-
-def propeller_scene() -> Scene:
-    """Return the propeller of the paper."""
-    problem = Problem.build(propeller(), NeoHookeanLn(0.3), fixed=Tag("bore"))
-    return _scene(problem, n_modes=10, deflection=0.055)
+    return _scene(
+        fem.Problem.build(
+            fem.box([100.0, 10.0, 10.0], [25, 4, 4]), fem.NeoHookeanLn(0.3), fixed=END
+        )
+    )
 
 
 def bracket() -> Scene:
     """Return an L-bracket of quadratic tetrahedra, nearly incompressible."""
-    whole = box([1.0, 1.0, 0.25], [7, 7, 3], "tetra")
+    whole = fem.box([1.0, 1.0, 0.25], [7, 7, 3], "tetra")
     x, y = whole.p[:2, whole.t].mean(axis=1)
     mesh = whole.restrict(np.flatnonzero((x < 1 / 3) | (y < 1 / 3)))
-    problem = Problem.build(mesh, NeoHookeanLn(0.45), fixed=Plane(1, "max"), degree=2)
+    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(0.45), fixed=fem.Plane(1, "max"), degree=2)
     return _scene(problem)
 
 
 def plate() -> Scene:
     """Return a plate of quadratic hexahedra, fifty times as long as thick."""
-    mesh = box([100.0, 50.0, 2.0], [13, 7, 2])
-    return _scene(Problem.build(mesh, NeoHookeanLn(0.3), fixed=END, degree=2))
+    mesh = fem.box([100.0, 50.0, 2.0], [13, 7, 2])
+    return _scene(fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), fixed=END, degree=2))
 
 
-END = Plane(0, "min")
+END = fem.Plane(0, "min")
 BODIES: Mapping[str, Callable[[], Scene]] = {
     "beam": beam,
     "column": column,
-    "propeller": propeller_scene,
+    "propeller": peers.propeller_scene,
     "bracket": bracket,
     "plate": plate,
 }
 
 
-def _scene(problem: Problem, *, n_modes: int = 5, deflection: float = 0.4) -> Scene:
-    newton = Newton(problem)
-    loads = ModalLoads(newton.linear_solver, n_modes=n_modes, deflection=deflection)
-    return Scene(problem, loads, newton)
+def _scene(problem: fem.Problem) -> Scene:
+    newton = fem.Newton(problem)
+    return Scene(problem, fem.ModalLoads(newton.linear_solver, deflection=0.4), newton)
 
 
-def solved_data(scene: Scene, sizes: Sizes, folder: Path) -> DataModule:
+def solved_data(scene: Scene, folder: Path, train: int, val: int, test: int) -> DataModule:
     """Return the data set of a scene in a folder; missing loads are solved."""
-    data = DataModule(
-        scene, folder=str(folder), train=sizes.train, val=sizes.val, test=sizes.test, workers=0
-    )
+    data = DataModule(scene, folder=str(folder), train=train, val=val, test=test, workers=0)
     data.prepare_data()
     return data
 
@@ -173,11 +133,6 @@ def softened(scene: Scene, count: int, seed: int = 0) -> dict[str, Sample]:
     Compression and squeezing are 0.3 to 0.98 times the critical load; torsion deflects the body
     linearly by 0.04 to 0.4 L. A force across, of random direction, deflects it linearly by 4e-6 to
     0.04 L. Loads without a stable solution are left out.
-
-    Args:
-        scene: The scene.
-        count: Number of loads of each kind.
-        seed: Of the random numbers.
     """
     problem, rng = scene.problem, np.random.default_rng(seed)
     points = problem.points
@@ -202,7 +157,7 @@ def softened(scene: Scene, count: int, seed: int = 0) -> dict[str, Sample]:
             across = zero.clone()
             across[end, 1:] = torch.from_numpy(rng.standard_normal(2))
             loads.append(size * force + 0.4 * small * across / _deflection(scene, across))
-        samples = solved(scene, Load(torch.stack(loads), torch.ones(count).double()))
+        samples = solved(scene, fem.Load(torch.stack(loads), torch.ones(count).double()))
         stable = [_is_stable(scene, u[None]) for u in samples.displacement]
         found[name] = Sample(*(column[stable] for column in samples))
     return found
@@ -221,7 +176,7 @@ def _critical(scene: Scene, force: Tensor) -> float:
     """Return the factor of a force (N, D) [-] at which the body becomes unstable."""
 
     def is_stable(factor: float) -> bool:
-        found = solve(scene.newton, Load(factor * force[None], torch.ones(1).double()))
+        found = fem.solve(scene.newton, fem.Load(factor * force[None], torch.ones(1).double()))
         return bool(found.converged) and _is_stable(scene, found.displacement)
 
     high = 1e-4
@@ -241,15 +196,7 @@ def estimates(
     simulators: Mapping[str, Simulator],
     more: Mapping[str, Sample] = {},  # not changed
 ) -> Iterator[Estimate]:
-    """Yield true and estimated errors of the answers of simulators.
-
-    Args:
-        body: Name of the body.
-        scene: The scene.
-        samples: Solved loads in range, which are also doubled.
-        simulators: Simulators of the scene, by name.
-        more: Further solved loads, by name.
-    """
+    """Yield true and estimated errors of the answers of simulators."""
     doubled = solved(scene, samples.load._replace(force=2 * samples.force))
     for title, some in {IN_RANGE: samples, TWICE: doubled, **more}.items():
         for name, sim in simulators.items():
@@ -289,7 +236,7 @@ def trained(scene: Scene, data: DataModule, epochs: int) -> dict[str, Simulator]
     states = data.samples("train").displacement
     found = {name: Simulator(surrogate) for name, surrogate in surrogates.items()}
     vectors = cast(PODNet, surrogates["pod"].net).vectors[..., :MODES]
-    newton = SubspaceNewton.within(scene.problem, vectors, states[:256], tolerance=1e-2)
+    newton = fem.SubspaceNewton.within(scene.problem, vectors, states[:256], tolerance=1e-2)
     found["pod + modes"] = Simulator(surrogates["pod"], newton=newton)
     return found
 
@@ -319,3 +266,49 @@ def summarised(found: Sequence[Estimate]) -> list[Row]:
             )
         )
     return rows
+
+
+def conclude(found: Sequence[Estimate]) -> None:
+    """Print how many answers say too little, and how good small estimates are."""
+    pairs = np.array([(one.estimated, one.error) for one in found])
+    estimated, error = pairs[pairs[:, 1] > EXACT].T
+    said = estimated < SAID
+    ratios = estimated / error
+    small = np.quantile(ratios[estimated < 0.01], (0.01, 0.05, 0.5, 0.95))
+    infinite = np.isinf(pairs[:, 0])
+    large = ratios[(error > 1) & np.isfinite(estimated)]
+    print(
+        f"{len(found)} answers, {infinite.sum()} with an infinite estimate\n"
+        f"{said.sum()} say less than {SAID:.0%}: {(ratios[said] < LEAST).sum()} of them less than "
+        f"a third of the error, at least {ratios[said].min():.2g} times\n"
+        f"stated below 1 %: {', '.join(f'{x:.2g}' for x in small)} times (1, 5, 50, 95 %)\n"
+        f"errors above 100 %: at least {min(large, default=math.nan):.2g} times"
+    )
+
+
+def draw(found: Sequence[Estimate], path: Path) -> None:
+    """Draw estimated over true error against the true error, a panel for each body."""
+    bodies = list(dict.fromkeys(one.body for one in found))
+    kinds = list(dict.fromkeys(one.loads for one in found))
+    rows = math.ceil(len(bodies) / 2)
+    with picture(path, 2.4 * rows + 0.6) as figure:
+        axes = figure.subplots(rows, min(len(bodies), 2), sharex=True, sharey=True, squeeze=False)
+        for ax, body in zip(axes.flat, bodies, strict=False):
+            ax.axhspan(LEAST, 1 / LEAST, color="0.93", lw=0)
+            ax.axhline(1.0, color="0.5", lw=0.7)
+            for colour, loads in zip(LOAD_COLOURS, kinds, strict=False):
+                own = [one for one in found if (one.body, one.loads) == (body, loads)]
+                own = [one for one in own if one.error > EXACT]
+                errors = np.array([one.error for one in own])
+                ratios = np.array([one.estimated for one in own]) / errors
+                ax.plot(errors, ratios, "o", ms=2.6, color=colour, mew=0, alpha=0.6, label=loads)
+            ax.set(xscale="log", yscale="log", title=body)
+            ax.grid(visible=True)
+        for ax in axes[:, 0]:
+            ax.set_ylabel("estimated / true error")
+        for ax in axes[-1]:
+            ax.set_xlabel("true relative error")
+        for ax in axes.flat[len(bodies) :]:
+            ax.remove()
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=5, markerscale=2.5)

@@ -2,64 +2,40 @@
 
 import statistics
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from dpl import Scene
-from dpl.fem import Load, solve, symmetries
-
-Guess = Callable[[Load], Tensor]  # loads to displacements (B, N, D) [-]
+from dpl.fem import symmetries
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of one method on the same loads, one at a time, on one core.
+    """Cost of one method on the same loads, one at a time, on one core."""
 
-    Attributes:
-        method: Name of the method.
-        seconds: Median time of a sample [s].
-        rate: Number of samples over the sum of their times [1/s].
-        iterations, factorisations: Mean numbers per sample.
-        accepted: Number of accepted samples.
-    """
-
-    method: str
-    seconds: float
-    rate: float
+    method: str  # name of the method
+    seconds: float  # median time of a sample [s]
+    rate: float  # number of samples over the sum of their times [1/s]
+    # iterations, factorisations: mean numbers per sample
     iterations: float
     factorisations: float
-    accepted: int
+    accepted: int  # number of accepted samples
 
 
-def costs(
-    scene: Scene, loads: int, *, pool: int = 256, surrogate: Guess | None = None
-) -> list[Cost]:
-    """Return the cost of a sample of each method; the methods alternate on each load.
-
-    Args:
-        scene: The scene.
-        loads: Number of loads that each method solves.
-        pool: Number of solved loads; the nearest one is a guess.
-        surrogate: A further source of guesses.
-    """
+def costs(scene: Scene, loads: int) -> list[Cost]:
+    """Return the cost of a sample of each method; the methods alternate on each load."""
     newton = scene.newton
-    once = replace(newton, factor_reuse_tol=0.0)
-    starts: dict[str, tuple[object, Guess | None]] = {
-        "a factor for every tangent": (once, None),
-        "factors reused (the generator)": (newton, None),
-        "the same, from the nearest solved load": (newton, _nearest(scene, pool)),
+    solvers = {
+        "a factor for every tangent": replace(newton, factor_reuse_tol=0.0),
+        "factors reused (the generator)": newton,
     }
-    if surrogate is not None:
-        starts["the same, from the surrogate"] = (newton, surrogate)
-    found: dict[str, list[tuple[float, int, int, bool]]] = {method: [] for method in starts}
+    found: dict[str, list[tuple[float, int, int, bool]]] = {method: [] for method in solvers}
     for k in range(-1, loads):  # the first one is not timed
         load = scene.loads.sample((1, 0), [max(k, 0)])
-        for method, (solver, guess) in starts.items():
+        for method, solver in solvers.items():
             start = time.perf_counter()
-            (*_, answer) = solver.iterate(load, guess=guess(load) if guess else None)  # type: ignore[attr-defined]
+            (*_, answer) = solver.iterate(load)
             seconds = time.perf_counter() - start
             count = int(answer.iterations), int(answer.factorisations), bool(answer.stable)
             if k >= 0:
@@ -97,22 +73,3 @@ def _images(scene: Scene, solved: Cost) -> Cost:
         solved.factorisations / count,
         solved.accepted,
     )
-
-
-def _nearest(scene: Scene, pool: int) -> Guess:
-    """Return a guess: the solution of the nearest of `pool` solved loads, corrected linearly.
-
-    The distance is that of the linear solutions. The linear solution of the difference is added.
-    """
-    loads = scene.loads.sample((2, 0), range(pool))
-    answers = [solve(scene.solver, single) for single in loads.unbatch()]
-    displacement = torch.cat([answer.displacement for answer in answers])
-    linear = torch.stack([scene.linear.solve(force) for force in loads.force])
-
-    def guess(load: Load) -> Tensor:
-        response = scene.linear.solve(load.force[0])
-        distance = (linear - response).flatten(1).norm(dim=1)
-        k = int(distance.argmin())
-        return (displacement[k] + response - linear[k])[None]
-
-    return guess

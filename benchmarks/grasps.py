@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.study import picture
+from benchmarks.study import METHOD_COLOURS, picture
 from dpl import Scene
 from dpl.fem import Load, RigidPatch, Sphere
 from dpl.inference import Gripper
@@ -32,17 +32,11 @@ REFERENCE_TOL = 1e-9  # relative residual of the solutions that errors are relat
 
 @dataclass(frozen=True)
 class Grasp:
-    """A patch and its motion.
+    """A patch and its motion."""
 
-    Attributes:
-        region: The patch.
-        translation: (3,) [m].
-        rotation: Rotation vector, (3,) [rad].
-    """
-
-    region: Sphere
-    translation: list[float]
-    rotation: list[float]
+    region: Sphere  # the patch
+    translation: list[float]  # (3,) [m]
+    rotation: list[float]  # rotation vector, (3,) [rad]
 
     def scaled(self, factor: float) -> "Grasp":
         """Return the grasp with a motion of `factor` times the size."""
@@ -52,55 +46,41 @@ class Grasp:
 
 @dataclass(frozen=True)
 class Row:
-    """Errors and times of a method for many grasps.
+    """Errors and times of a method for many grasps."""
 
-    Attributes:
-        method: "prediction", "corrected", "hybrid to 1e-6" or "Newton from rest to 1e-6".
-        count: Number of grasps.
-        found: Part of the grasps with forces under which the network predicts the motion [%]; 100
-            for Newton's method from rest.
-        motion_met: Part of the grasps with all held nodes within 1e-3 L of their places [%].
-        rel_L2_median, rel_L2_p95, rel_L2_worst: Relative L2 errors of displacements [-].
-        force_median, force_p95, force_worst: Relative errors of the resultant force [-].
-        moment_p95: Error of the moment, over the moment plus force times radius [-].
-        converged: Part of the grasps that converge to the tolerance of the method [%].
-        silent: Grasps with an error above `WRONG` that the estimated error does not report.
-        iterations: Mean number of linear solves; of the network, of predictions and corrections.
-        p50_ms, p99_ms: Times of a grasp of a patch that is prepared, one thread [ms].
-    """
-
-    method: str
-    count: int
+    method: str  # "prediction", "corrected", "hybrid to 1e-6" or "Newton from rest to 1e-6"
+    count: int  # number of grasps
+    # part of the grasps with forces under which the network predicts the motion [%]; 100 for
+    # Newton's method from rest
     found: float
-    motion_met: float
+    motion_met: float  # part of the grasps with all held nodes within 1e-3 L of their places [%]
+    # rel_L2_median, rel_L2_p95, rel_L2_worst: relative L2 errors of displacements [-]
     rel_L2_median: float
     rel_L2_p95: float
     rel_L2_worst: float
+    # force_median, force_p95, force_worst: relative errors of the resultant force [-]
     force_median: float
     force_p95: float
     force_worst: float
-    moment_p95: float
-    converged: float
-    silent: int
+    moment_p95: float  # error of the moment, over the moment plus force times radius [-]
+    converged: float  # part of the grasps that converge to the tolerance of the method [%]
+    silent: int  # grasps with an error above `WRONG` that the estimated error does not report
+    # mean number of linear solves; of the network, of predictions and corrections
     iterations: float
+    # p50_ms, p99_ms: times of a grasp of a patch that is prepared, one thread [ms]
     p50_ms: float
     p99_ms: float
 
 
 @dataclass(frozen=True)
 class Amplitude:
-    """Errors of predictions for grasps of one amplitude.
+    """Errors of predictions for grasps of one amplitude."""
 
-    Attributes:
-        amplitude: Factor on the motions [-].
-        error: Median over the grasps of the error of the displacement, its norm over that at the
-            amplitude 1 [-].
-        linear: The same of the linear solution.
-    """
-
-    amplitude: float
+    amplitude: float  # factor on the motions [-]
+    # median over the grasps of the error of the displacement, its norm over that at the amplitude 1
+    # [-]
     error: float
-    linear: float
+    linear: float  # the same of the linear solution
 
 
 def random_grasps(scene: Scene, count: int, seed: int = 0) -> Iterator[Grasp]:
@@ -108,14 +88,6 @@ def random_grasps(scene: Scene, count: int, seed: int = 0) -> Iterator[Grasp]:
 
     Motions are isotropic in the linear energy norm: soft directions have large displacements. The
     linear energy is at most that of the largest of `LOADS` training loads.
-
-    Args:
-        scene: The body and its training loads.
-        count: Number of grasps.
-        seed: Of the random numbers.
-
-    Raises:
-        ValueError: The mesh is too coarse: patches have fewer than three nodes.
     """
     rng, problem = np.random.default_rng(seed), scene.problem
     loads = scene.loads.sample((seed, 9), range(LOADS)).force
@@ -154,19 +126,12 @@ def rigid_stiffness(patch: RigidPatch) -> np.ndarray:
 
 
 class Reference(NamedTuple):
-    """Solution of Newton's method.
+    """Solution of Newton's method."""
 
-    Attributes:
-        displacement: (N, D) [-].
-        force: Forces of the gripper, (N, D) [-].
-        iterations: Linear solves.
-        milliseconds: Wall time [ms].
-    """
-
-    displacement: Tensor
-    force: Tensor
-    iterations: int
-    milliseconds: float
+    displacement: Tensor  # (N, D) [-]
+    force: Tensor  # forces of the gripper, (N, D) [-]
+    iterations: int  # linear solves
+    milliseconds: float  # wall time [ms]
 
 
 def references(scene: Scene, patch: RigidPatch, grasp: Grasp) -> list[Reference] | None:
@@ -194,13 +159,7 @@ def references(scene: Scene, patch: RigidPatch, grasp: Grasp) -> list[Reference]
 def measure(
     gripper: Gripper, grasps: Sequence[Grasp], done: Callable[[int], None] = lambda k: None
 ) -> tuple[list[Row], int]:
-    """Return a row for each method, and the number of grasps without a reference solution.
-
-    Args:
-        gripper: Gripper of a scene in 3D.
-        grasps: The grasps.
-        done: Called with the number of grasps that are finished.
-    """
+    """Return a row for each method, and the number of grasps without a reference solution."""
     scene = gripper.scene
     raw = Gripper(gripper.surrogate, steps=0)
     options = {
@@ -236,14 +195,7 @@ def measure(
 def _errors(
     patch: RigidPatch, radius: float, found: tuple[Tensor, Tensor], exact: Reference
 ) -> list[float]:
-    """Return the relative errors of displacement, force and moment.
-
-    Args:
-        patch: The patch.
-        radius: Its radius [-].
-        found: Displacement and forces of the gripper, (N, D) [-].
-        exact: The reference.
-    """
+    """Return the relative errors of displacement, force and moment."""
     ours = patch.wrench(found[1], found[0])
     theirs = patch.wrench(exact.force, exact.displacement)
     force, moment = theirs.force.norm(), theirs.moment.norm()
@@ -282,10 +234,6 @@ def against_amplitude(gripper: Gripper, grasps: Sequence[Grasp]) -> list[Amplitu
     """Return the median errors of predictions at decreasing amplitudes; slope two is expected.
 
     Grasps without a reference solution are left out.
-
-    Args:
-        gripper: Gripper of a scene in 3D.
-        grasps: The grasps at the amplitude 1.
     """
     raw = Gripper(gripper.surrogate, steps=0)
     factors = [2.0**-k for k in range(HALVINGS + 1)]
@@ -325,19 +273,15 @@ def slope(rows: Sequence[Amplitude]) -> float:
     return float(np.polyfit(x, y, 1)[0])
 
 
-def draw(rows: Sequence[Amplitude], file: Path) -> None:
-    """Draw the errors of predictions and of linear solutions against the amplitude.
-
-    Args:
-        rows: Rows of `against_amplitude`.
-        file: Of the picture.
-    """
+def draw(rows: Sequence[Amplitude], path: Path) -> None:
+    """Draw the errors of predictions and of linear solutions against the amplitude."""
     x = np.array([row.amplitude for row in rows])
-    with picture(file, 4.2, 3.0) as figure:
+    colour, grey = (METHOD_COLOURS[name] for name in ("unrolled", "linear"))
+    with picture(path) as figure:
         ax = figure.subplots()
-        ax.loglog(x, [row.linear for row in rows], "s-", color="0.6", label="linear solution")
-        ax.loglog(x, [row.error for row in rows], "o-", color="black", label="network")
-        ax.loglog(x, rows[0].error * x**2, ":", color="black", label="slope 2")
-        ax.set_xlabel("amplitude of the motion [-]")
-        ax.set_ylabel("error of the displacement [-]")
+        ax.loglog(x, [row.linear for row in rows], "s-", color=grey, label="linear solution")
+        ax.loglog(x, [row.error for row in rows], "o-", color=colour, label="prediction")
+        ax.loglog(x, rows[0].error * x**2, ":", color=colour, label="slope 2")
+        ax.set(xlabel="amplitude of the motion [-]", ylabel="error of the displacement [-]")
+        ax.grid(visible=True)
         ax.legend()

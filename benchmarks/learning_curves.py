@@ -1,40 +1,31 @@
 """Learning curves of runs: validation errors after each epoch that was validated."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.paper_tables import PLAIN
-from benchmarks.study import method_colours, picture
-from dpl.evaluation.tables import write
+from benchmarks.study import method_colours, picture, record
 
 ERROR = "val/rel_L2_median"
+MARKS = "osD^v"  # of the runs of a method
 CSV_LOG = Path("csv", "metrics.csv")  # see conf/logger/csv.yaml
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Error of a run after an epoch.
+    """Error of a run after an epoch."""
 
-    Attributes:
-        method: Name of the run.
-        epoch: Number of epochs that were trained.
-        rel_L2_median: Median relative L2 error of the validation loads [-].
-    """
-
-    method: str
-    epoch: int
-    rel_L2_median: float
+    method: str  # name of the run
+    epoch: int  # number of epochs that were trained
+    rel_L2_median: float  # median relative L2 error of the validation loads [-]
 
 
 def curve(folder: Path) -> list[Validation]:
     """Return the validations of a run from its logs; empty without logs or validations.
 
     A resumed run has several logs. Of an epoch that was validated twice, the last value counts.
-
-    Args:
-        folder: Folder of the run, with logs of TensorBoard or of `logger=csv`.
     """
     found = dict(_from_csv(folder / CSV_LOG))
     for path in sorted(folder.glob("events.out.tfevents.*")):
@@ -61,42 +52,27 @@ def _from_events(path: Path) -> dict[int, float]:
 
 
 def save(runs: Sequence[Path], stem: Path) -> bool:
-    """Write the learning curves of runs as CSV and PNG; return False if no run has one.
-
-    Args:
-        runs: Folders of the runs.
-        stem: Path of the files without extension.
-    """
-    curves = {folder.name: line for folder in runs if len(line := curve(folder)) > 1}
-    if curves:
-        write([point for line in curves.values() for point in line], stem.with_suffix(".csv"))
-        draw(curves, stem.with_suffix(".png"))
-    return bool(curves)
+    """Write the learning curves of runs as CSV and PNG; return False if no run has one."""
+    curves = [line for folder in runs if len(line := curve(folder)) > 1]
+    return bool(record([point for line in curves for point in line], stem, None, draw))
 
 
-def draw(curves: Mapping[str, Sequence[Validation]], path: Path) -> None:
-    """Draw validation errors over epochs on logarithmic scales, a labelled line for each run.
+def draw(rows: Sequence[Validation], path: Path) -> None:
+    """Draw validation errors over epochs, a line for each run; dashed without the linear base."""
+    from matplotlib.ticker import LogLocator
 
-    Networks on the linear solution have the colour of the network without it and a solid line; the
-    lines of networks without it are dashed.
-
-    Args:
-        curves: Validations by name of the run, two or more each.
-        path: Path of the picture.
-    """
-    families = {name: name.partition("_")[0] for name in curves}
-    colours = method_colours(families.values())
-    with picture(path, 5.6, 3.4) as figure:
+    last = {row.method: row.rel_L2_median for row in rows}
+    colours = method_colours(sorted(last, key=lambda name: -last[name]))
+    with picture(path) as figure:
         ax = figure.subplots()
-        for name, line in curves.items():
-            epochs, errors = zip(
-                *((point.epoch, point.rel_L2_median) for point in line), strict=True
-            )
-            colour, dashes = colours[families[name]], "--" if PLAIN in name else "-"
-            ax.plot(epochs, errors, marker="o", ms=3, lw=1.2, color=colour, ls=dashes)
-            ax.annotate(
-                name, (epochs[-1], errors[-1]), xytext=(5, 0), textcoords="offset points",
-                va="center", fontsize=7.5, color=colour,
-            )  # fmt: skip
-        ax.set(xscale="log", yscale="log", xlabel="epochs", ylabel="median relative L2 error")
+        for k, (name, colour) in enumerate(colours.items()):
+            line = [(row.epoch, row.rel_L2_median) for row in rows if row.method == name]
+            mark = MARKS[list(colours.values())[:k].count(colour) % len(MARKS)]  # of this colour
+            style = {"marker": mark, "ms": 3.5, "lw": 1.2, "color": colour, "label": name}
+            ax.loglog(*zip(*line, strict=True), ls="--" if PLAIN in name else "-", **style)
+        ax.set(xlabel="epochs", ylabel="median relative L2 error")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_formatter("")
         ax.grid(visible=True)
+        ax.legend()

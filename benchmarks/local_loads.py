@@ -33,47 +33,35 @@ RUN = "loads of the run"
 
 @dataclass(frozen=True)
 class LocalLoads:
-    """Errors and latencies of one kind of loads on one thread.
+    """Errors and latencies of one kind of loads on one thread."""
 
-    Attributes:
-        loads: Name of the kind.
-        deflection: Largest linear deflection over L [-]; None for the loads of the run.
-        count: Number of loads with a stable equilibrium.
-        linear_p50, linear_p99: Percentiles of the relative error of the linear solution [-].
-        error_p50, error_p99: The same of the prediction, against Newton [-].
-        predict_p50, predict_p99: Percentiles of the wall time of a prediction [ms].
-        sim_error_p50, sim_error_p99: Percentiles of the relative error of `sim(force)` [-].
-        sim_p50, sim_p99: Percentiles of the wall time of `sim(force)` [ms].
-        onnx_p50, onnx_p99: The same of the ONNX graph; None if its packages are missing.
-        onnx_error: Largest relative difference of graph and prediction [-]; None like these.
-    """
-
-    loads: str
-    deflection: float | None
-    count: int
+    loads: str  # name of the kind
+    deflection: float | None  # largest linear deflection over L [-]; None for the loads of the run
+    count: int  # number of loads with a stable equilibrium
+    # linear_p50, linear_p99: percentiles of the relative error of the linear solution [-]
     linear_p50: float
     linear_p99: float
+    # error_p50, error_p99: the same of the prediction, against Newton [-]
     error_p50: float
     error_p99: float
+    # predict_p50, predict_p99: percentiles of the wall time of a prediction [ms]
     predict_p50: float
     predict_p99: float
+    # sim_error_p50, sim_error_p99: percentiles of the relative error of `sim(force)` [-]
     sim_error_p50: float
     sim_error_p99: float
+    # sim_p50, sim_p99: percentiles of the wall time of `sim(force)` [ms]
     sim_p50: float
     sim_p99: float
+    # onnx_p50, onnx_p99: the same of the ONNX graph; None if its packages are missing
     onnx_p50: float | None = None
     onnx_p99: float | None = None
+    # largest relative difference of graph and prediction [-]; None like these
     onnx_error: float | None = None
 
 
 def measure(surrogate: TrainedSurrogate, count: int, *, repeats: int = 1) -> Iterator[LocalLoads]:
-    """Yield the rows of local loads and of the loads of the run.
-
-    Args:
-        surrogate: A trained `dpl.models.Unrolled` as a surrogate.
-        count: Number of loads of each kind.
-        repeats: Number of timed calls with each load.
-    """
+    """Yield the rows of local loads and of the loads of the run."""
     scene, simulator = surrogate.scene, Simulator(surrogate)
     session = None
     if not missing_packages():

@@ -18,27 +18,20 @@ HYBRID = "paper's hybrid"  # begins the name of its row in an evaluation
 
 @dataclass(frozen=True)
 class LossRow:
-    """Medians over the runs of a loss with different seeds.
+    """Medians over the runs of a loss with different seeds."""
 
-    Attributes:
-        runs: Common name of the runs, network and loss.
-        seeds: Number of runs.
-        e_mean, e_max, SNR_min, rel_L2_median, rel_L2_worst, residual: See `dpl.training.metrics`;
-            of the test loads.
-        hybrid_iterations: Mean iterations of the paper's hybrid from the predictions.
-        training_minutes: Wall time of a training [min].
-    """
-
-    runs: str
-    seeds: int
+    runs: str  # common name of the runs, network and loss
+    seeds: int  # number of runs
+    # e_mean, e_max, SNR_min, rel_L2_median, rel_L2_worst, residual: See `dpl.training.metrics`; of
+    # the test loads
     e_mean: float
     e_max: float
     SNR_min: float
     rel_L2_median: float
     rel_L2_worst: float
     residual: float
-    hybrid_iterations: float
-    training_minutes: float
+    hybrid_iterations: float  # mean iterations of the paper's hybrid from the predictions
+    training_minutes: float  # wall time of a training [min]
 
 
 def numbers(folder: Path) -> list[float]:
@@ -55,11 +48,7 @@ def numbers(folder: Path) -> list[float]:
 
 
 def summaries(runs: Mapping[str, Sequence[float]]) -> list[LossRow]:
-    """Return a row for each group of runs whose names differ only in the seed at their end.
-
-    Args:
-        runs: Numbers of each run, see `numbers`, by its name: NETWORK-LOSS-SEED.
-    """
+    """Return a row for each group of runs whose names differ only in the seed at their end."""
     groups: dict[str, list[Sequence[float]]] = {}
     for name, values in runs.items():
         stem, _, seed = name.rpartition("-")

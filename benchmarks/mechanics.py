@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from benchmarks import generation as ways
 from benchmarks import peers
-from benchmarks.study import record, redraw
+from benchmarks.study import record
 from dpl import Scene, config
 from dpl.evaluation.tables import machine
 from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed_backends
@@ -23,22 +23,15 @@ from dpl.system.threads import one_thread
 
 CASES = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
-    *("discretisation", "sizes", "modes", "laws", "deflections", "latency", "local", "newton"),
-    "frames",
+    *("discretisation", "sizes", "deflections", "latency", "local"),
 )
-FIGURES = "figures"  # the case that draws the rows in `folder` again
 
 
 def run(cfg: DictConfig) -> None:
-    """Measure the chosen cases; print tables and write rows to `folder`.
-
-    Raises:
-        ConfigError: A case or a backend does not exist, or no backend is installed.
-    """
+    """Measure the chosen cases; print tables and write rows to `folder`."""
     cases = CASES if cfg.cases is None else cfg.cases
-    if unknown := [case for case in cases if case not in (*CASES, FIGURES)]:
-        known = ", ".join((*CASES, FIGURES))
-        raise config.ConfigError(f"cases = {unknown[0]!r} must be one of {known}")
+    if unknown := [case for case in cases if case not in CASES]:
+        raise config.ConfigError(f"cases = {unknown[0]!r} must be one of {', '.join(CASES)}")
     if unknown := [name for name in cfg.linear if name not in ("auto", *BACKENDS)]:
         known = ", ".join(("auto", *BACKENDS))
         raise config.ConfigError(f"linear: {unknown[0]!r} is none of {known}")
@@ -120,14 +113,10 @@ def generation(cfg: DictConfig) -> None:
         "paper's beam, NH-ln": peers.beam_scene(NeoHookeanLn(0.3)),
         "paper's propeller, NH-ln": peers.propeller_scene(),
     }
-    guess = None
-    if cfg.run is not None:
-        surrogate = config.load_run(cfg.run)[1]
-        scenes, guess = {cfg.run: surrogate.scene}, surrogate.predict
     rows = (
         replace(row, method=f"{name}: {row.method}")
         for name, scene in scenes.items()
-        for row in ways.costs(scene, cfg.samples, surrogate=guess)
+        for row in ways.costs(scene, cfg.samples)
     )
     record(rows, Path(cfg.folder) / "generation", f"a sample on one core, {cfg.samples} loads")
 
@@ -149,24 +138,6 @@ def sizes(cfg: DictConfig) -> None:
     parts = beams.sizes(cfg.cells_across, loads=cfg.repeats)
     rows = (row for part in parts for row in part)
     record(rows, Path(cfg.folder) / "sizes", "beams of growing size", beams.draw)
-
-
-def modes(cfg: DictConfig) -> None:
-    """Record the times of K(0)'s factor and of its modes on beams of growing size."""
-    from benchmarks import modes as beams
-
-    rows = beams.mode_times(repeats=cfg.repeats)
-    record(rows, Path(cfg.folder) / "modes", "five modes or more of a beam; first row: the paper")
-
-
-def laws(cfg: DictConfig) -> None:
-    """Record the times of tangent and residual of bodies of several laws and with fibres."""
-    from benchmarks import law_costs
-
-    rows = law_costs.law_costs(repeats=8 * cfg.repeats)
-    record(rows, Path(cfg.folder) / "law_costs", "tangent and residual, compiled")
-    residual, both = (slow / fast for fast, slow in law_costs.energy_alone_costs())
-    print(f"by the energy alone: residual {residual:.0f}, with tangent {both:.0f} times")
 
 
 def deflections(cfg: DictConfig) -> None:
@@ -191,42 +162,14 @@ def latency(cfg: DictConfig) -> None:
     """Record the wall times of a trained run."""
     from benchmarks import run_latency
 
-    simulator, folder = Simulator(config.load_run(_run(cfg, "latency"))[1]), Path(cfg.folder)
+    simulator = Simulator(config.load_run(_run(cfg, "latency"))[1])
     load = simulator.scene.loads.sample((0, 2), range(cfg.samples))
     calls = run_latency.call_times(simulator, load, repeats=cfg.repeats)
-    record(calls, folder / "latency", "one load, one thread [ms]")
-    rates = run_latency.throughputs(simulator, repeats=cfg.repeats)
-    record(rates, folder / "throughput", "predictions in batches")
-
-
-def newton(cfg: DictConfig) -> None:
-    """Record the times of all runs below a folder to tolerances, beside those of Newton's method.
-
-    Raises:
-        ConfigError: No folder is named, or it contains no runs.
-    """
-    from benchmarks import run_latency
-
-    folders = sorted(path.parent for path in Path(cfg.run or "").glob("**/config.yaml"))
-    if cfg.run is None or not folders:
-        raise config.ConfigError(f"run = {cfg.run} must name a folder of runs for cases=[newton]")
-
-    def rows() -> Iterator[run_latency.AgainstNewton]:
-        for folder in folders:
-            simulator = Simulator(config.load_run(folder)[1])
-            load = simulator.scene.loads.sample((0, 2), range(cfg.samples))
-            name = str(folder.relative_to(cfg.run))
-            yield from run_latency.against_newton(name, simulator, load, repeats=cfg.repeats)
-
-    record(rows(), Path(cfg.folder) / "against_newton", "one load, one thread [ms]")
+    record(calls, Path(cfg.folder) / "latency", "one load, one thread [ms]")
 
 
 def local(cfg: DictConfig) -> None:
-    """Record errors and latencies of a trained run of `unrolled` for loads on small areas.
-
-    Raises:
-        ConfigError: The run is none of `unrolled`.
-    """
+    """Record errors and latencies of a trained run of `unrolled` for loads on small areas."""
     from benchmarks import local_loads
     from dpl.models import Unrolled
 
@@ -238,52 +181,8 @@ def local(cfg: DictConfig) -> None:
     record(rows, stem, "loads on small areas, one thread [ms]")
 
 
-def frames(cfg: DictConfig) -> None:
-    """Record the times of the frames of the page of a trained run; print latencies beside them.
-
-    Raises:
-        ConfigError: The extra `viewer` is not installed.
-    """
-    from dpl import load, viewer
-    from dpl.commands.cli import require_viewer
-    from dpl.evaluation.timing import describe
-
-    run = _run(cfg, "frames")
-    require_viewer()
-    from benchmarks import frame_rate
-
-    body, policy = viewer.Body(load(run)), viewer.AccessPolicy.bind("127.0.0.1", 0)
-    page = viewer.Page(body, policy, title=run, folder=Path(cfg.folder))
-    try:
-        rows, latencies = frame_rate.measure_frames(page)
-    finally:
-        page.close()
-    title = "times per frame on the server, and frames received by a client"
-    record(rows, Path(cfg.folder) / "frames", title)
-    print(describe(latencies))
-
-
-def figures(cfg: DictConfig) -> None:
-    """Draw the figures of `sizes`, `deflections`, ablation and estimated errors from their rows."""
-    from benchmarks import ablation, ablation_figures, error_estimate_figure, error_estimates
-    from benchmarks import deflections as bent
-    from benchmarks import sizes as beams
-
-    folder = Path(cfg.folder)
-    redraw(beams.Size, folder / "sizes.csv", beams.draw)
-    redraw(bent.Deflection, folder / "deflections.csv", bent.draw)
-    redraw(ablation.Row, folder / "unrolled.csv", ablation_figures.draw)
-    for path in folder.glob("error_estimates*_loads.csv"):
-        stem = path.stem.removesuffix("_loads")
-        redraw(error_estimates.Estimate, path, error_estimate_figure.draw, stem=stem)
-
-
 def _run(cfg: DictConfig, case: str) -> str:
-    """Return the folder of the run that a case needs.
-
-    Raises:
-        ConfigError: No run is named.
-    """
+    """Return the folder of the run that a case needs."""
     if cfg.run is None:
         raise config.ConfigError(f"run = null must name the trained run for cases=[{case}]")
     return str(cfg.run)

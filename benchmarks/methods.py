@@ -20,19 +20,12 @@ CELL_STATES = 256  # states at which the cells of hyper-reduction are chosen
 
 @dataclass(frozen=True)
 class Method:
-    """A method that predicts displacements, and the cost of its training.
+    """A method that predicts displacements, and the cost of its training."""
 
-    Attributes:
-        predict: Function from a load to displacements (B, N, D) [-].
-        samples: Number of training samples; None without training.
-        training_minutes: Wall time of the training [min]; None without training.
-        parameters: Number of trained parameters; None without training.
-    """
-
-    predict: Predict
-    samples: int | None = None
-    training_minutes: float | None = None
-    parameters: int | None = None
+    predict: Predict  # function from a load to displacements (B, N, D) [-]
+    samples: int | None = None  # number of training samples; None without training
+    training_minutes: float | None = None  # wall time of the training [min]; None without training
+    parameters: int | None = None  # number of trained parameters; None without training
 
 
 def linear(scene: Scene) -> Method:

@@ -7,11 +7,13 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from benchmarks.plain_newton import PlainNewton
+from benchmarks.study import dots, dots_legend, method_colours, picture
 from dpl.evaluation.timing import time_interleaved
 from dpl.fem import AndersonSolver, Load, Solver
 from dpl.inference import Hybrid
@@ -22,78 +24,49 @@ from dpl.system.threads import one_thread
 PLAIN = ("plain Newton", "hybrid, paper's rule")  # solvers without safeguards
 REFERENCE = "robust Newton"  # solver with which times and displacements are compared
 # random streams of the sets of loads; 2 is the stream of the test loads
-STREAMS = {"in range": 2, "twice": 4, "3 times": 7, "5 times": 8}
+STREAMS = {"in range": 2, "twice": 4}
 BOTH = "in range and twice"  # the set of loads in the paper
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A solver, a set of loads and a tolerance.
+    """A solver, a set of loads and a tolerance."""
 
-    Attributes:
-        solver: Name of the solver.
-        network: Name of the network that predicts the initial state; empty for rest.
-        loads: Name of the set of loads.
-        tol: Relative residual [-].
-    """
-
-    solver: str
-    network: str
-    loads: str
-    tol: float
+    solver: str  # name of the solver
+    network: str  # name of the network that predicts the initial state; empty for rest
+    loads: str  # name of the set of loads
+    tol: float  # relative residual [-]
 
 
 @dataclass(frozen=True)
 class Trial(Setting):
-    """Result of one solver for one load.
+    """Result of one solver for one load."""
 
-    Attributes:
-        number: Index of the load in its set.
-        converged: The residual is below the tolerance and no element is inverted.
-        used_prediction: The solver iterated from the prediction.
-        iterations: Number of linear solves.
-        factorisations: Number of factorised tangents.
-        ms: Wall time with the prediction [ms].
-        deviation: Relative L2 distance from the solution of robust Newton [-].
-        step_tol, max_total_iter: Options of the solvers, see `solvers_of`.
-    """
-
-    number: int
-    converged: bool
-    used_prediction: bool
-    iterations: int
-    factorisations: int
-    ms: float
-    deviation: float
-    step_tol: float = 0.0
-    max_total_iter: int | None = None
+    number: int  # index of the load in its set
+    converged: bool  # the residual is below the tolerance and no element is inverted
+    used_prediction: bool  # the solver iterated from the prediction
+    iterations: int  # number of linear solves
+    factorisations: int  # number of factorised tangents
+    ms: float  # wall time with the prediction [ms]
+    deviation: float  # relative L2 distance from the solution of robust Newton [-]
 
 
 @dataclass(frozen=True)
 class Summary(Setting):
-    """Results of one solver for a set of loads; means and medians are over converged loads.
+    """Results of one solver for a set of loads; means and medians are over converged loads."""
 
-    Attributes:
-        count: Number of loads.
-        converged: Fraction of converged loads [%].
-        used_prediction_pct: Fraction of loads for which the solver used the prediction [%].
-        iterations: Mean number of linear solves.
-        max_iterations: Maximum number of linear solves.
-        factorisations: Mean number of factorised tangents.
-        ms: Median wall time with the prediction [ms].
-        time_ratio: Total wall time over that of robust Newton, for loads where both converged [-].
-        deviation: Largest relative L2 distance from the solution of robust Newton, for loads where
-            both converged [-].
-    """
-
-    count: int
-    converged: float
+    count: int  # number of loads
+    converged: float  # fraction of converged loads [%]
+    # fraction of loads for which the solver used the prediction [%]
     used_prediction_pct: float | None = None
-    iterations: float | None = None
-    max_iterations: int | None = None
-    factorisations: float | None = None
-    ms: float | None = None
+    iterations: float | None = None  # mean number of linear solves
+    max_iterations: int | None = None  # maximum number of linear solves
+    factorisations: float | None = None  # mean number of factorised tangents
+    ms: float | None = None  # median wall time with the prediction [ms]
+    # total wall time over that of robust Newton, for loads where both converged [-]
     time_ratio: float | None = None
+    # largest relative L2 distance from the solution of robust Newton, for loads where both
+    # converged [-]
     deviation: float | None = None
 
 
@@ -104,24 +77,14 @@ PAPER = [
 ]
 
 
-def load_sets(scene: Scene, count: int, far: int, *, twice: bool = True) -> dict[str, Load]:
-    """Return `count` test loads, as many scaled by 1 to 2, and `far` loads scaled by 3 and by 5.
-
-    Args:
-        scene: The scene.
-        count: Number of loads.
-        far: Number of loads of the last two sets.
-        twice: Whether the second set is returned.
-    """
+def load_sets(scene: Scene, count: int, *, twice: bool = True) -> dict[str, Load]:
+    """Return `count` test loads, and as many that are scaled by 1 to 2."""
     part = torch.linspace(0, 1, count, dtype=torch.float64)
-    factors = {"in range": 1 + 0 * part} | ({"twice": 1 + part} if twice else {})
-    factors |= {f"{k} times": torch.full((far,), float(k)).double() for k in (3, 5)}
     sets = {}
-    for name, factor in factors.items():
-        if len(factor):
-            drawn = scene.loads.sample((0, STREAMS[name]), range(len(factor)))
-            sets[name] = drawn._replace(force=factor[:, None, None] * drawn.force)
-    return sets
+    for name, factor in {"in range": 1 + 0 * part, "twice": 1 + part}.items():
+        drawn = scene.loads.sample((0, STREAMS[name]), range(count))
+        sets[name] = drawn._replace(force=factor[:, None, None] * drawn.force)
+    return sets if twice else {"in range": sets["in range"]}
 
 
 def solvers_of(
@@ -129,8 +92,6 @@ def solvers_of(
     networks: Mapping[str, Predict],
     tol: float,
     *,
-    max_total_iter: int | None = None,
-    step_tol: float = 0.0,
     names: Sequence[str] | None = None,
 ) -> dict[tuple[str, str], Solver]:
     """Return the solvers to compare, by name and network.
@@ -139,18 +100,10 @@ def solvers_of(
         scene: The scene.
         networks: Predictions by the name of their network.
         tol: Relative residual [-].
-        max_total_iter: Largest number of iterations of the solvers with safeguards; None: that of
-            the scene's solver.
-        step_tol: Norm of a step that ends plain Newton, see `PlainNewton` [-].
         names: Names of the solvers; None: all. `REFERENCE` is always one of them.
-
-    Raises:
-        ValueError: A name belongs to no solver.
     """
-    budget = max_total_iter or scene.newton.max_total_iter
-    robust = replace(scene.newton, tol=tol, max_total_iter=budget)
-    quick = replace(scene.corrector, tol=tol, max_total_iter=budget)
-    plain = PlainNewton(robust, step_tol=step_tol)
+    robust, quick = (replace(one, tol=tol) for one in (scene.newton, scene.corrector))
+    plain = PlainNewton(robust)
     solvers: dict[tuple[str, str], Solver] = {
         ("plain Newton", ""): plain,
         ("plain Newton, load steps", ""): replace(
@@ -178,24 +131,11 @@ def measure(
     load: Load,
     tol: float,
     tick: Callable[[], None] = lambda: None,
-    *,
-    step_tol: float = 0.0,
-    max_total_iter: int | None = None,
 ) -> list[Trial]:
-    """Return the results of all solvers for all loads, one load at a time on one thread.
-
-    Args:
-        solvers: Solvers by name and network, which contain `REFERENCE` from rest.
-        title: Name of the set of loads, for the record.
-        load: The loads.
-        tol: Relative residual of the solvers, for the record [-].
-        tick: Called after each load.
-        step_tol, max_total_iter: Options of the solvers, for the record, see `solvers_of`.
-    """
+    """Return the results of all solvers for all loads, one load at a time on one thread."""
     with one_thread(), torch.inference_mode():
         timed = time_interleaved(solvers, load, tick)
     reference = timed[REFERENCE, ""][0].displacement.flatten(1)
-    options: dict[str, Any] = {"step_tol": step_tol, "max_total_iter": max_total_iter}
     trials = []
     for (name, network), (solution, times) in timed.items():
         distance = (solution.displacement.flatten(1) - reference).norm(dim=1)
@@ -204,9 +144,7 @@ def measure(
             times, distance / reference.norm(dim=1),
         )  # fmt: skip
         numbers = zip(*(column.tolist() for column in columns), strict=True)
-        trials += [
-            Trial(name, network, title, tol, k, *row, **options) for k, row in enumerate(numbers)
-        ]
+        trials += [Trial(name, network, title, tol, k, *row) for k, row in enumerate(numbers)]
     return trials
 
 
@@ -271,3 +209,27 @@ def _summarise(trials: Sequence[Trial], reference: Sequence[Trial]) -> Summary:
         else None,
         deviation=reduced(max, (own.deviation for own, _ in both)),
     )
+
+
+def draw(rows: Sequence[Summary], path: Path) -> None:
+    """Draw converged loads, iterations and time of the solvers on the loads nearest to the paper's.
+
+    The tolerance is the middle one of those measured.
+    """
+    measured = [row for row in rows if not math.isnan(row.tol)]  # without those of the paper
+    loads = BOTH if any(row.loads == BOTH for row in measured) else measured[0].loads
+    tols = sorted({row.tol for row in measured})
+    shown = [r for r in measured if (r.loads, r.tol) == (loads, tols[len(tols) // 2])]
+    names = [f"{row.solver}\nfrom {row.network}" if row.network else row.solver for row in shown]
+    colours = method_colours(row.network or "Newton" for row in shown)
+    own, none = [colours[row.network or "Newton"] for row in shown], [None] * len(shown)
+    with picture(path, 0.32 * len(shown) + 1.0) as figure:
+        converged, iterations, time = figure.subplots(1, 3, sharey=True)
+        dots(converged, names, [row.converged for row in shown], none, own)
+        means, most = zip(*((row.iterations, row.max_iterations) for row in shown), strict=True)
+        dots(iterations, names, means, most, own)
+        dots(time, names, [row.time_ratio for row in shown], none, own)
+        converged.set(xlabel="converged loads [%]", xlim=(0, 105))
+        iterations.set(xlabel="iterations", xlim=(0, None))
+        time.set(xlabel="time / robust Newton", xlim=(0, None))
+        dots_legend(figure, "mean", "most")

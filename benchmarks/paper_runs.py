@@ -1,7 +1,6 @@
-"""Runs that the tables of the paper need: their plan, their states and the times that they took.
+"""Runs that the tables of the paper need: their plan and their states.
 
-The plan is data, `benchmarks/conf/paper.yaml`. A journal in the folder of the runs has a line for
-each session of a run: its options, its end and its wall time.
+The plan is data, `benchmarks/conf/paper.yaml`. The folder of a run keeps the options of its plan.
 """
 
 import itertools
@@ -12,14 +11,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from dpl.system.files import append_jsonl
-
-JOURNAL = "paper.jsonl"
+OPTIONS = "paper.json"  # file in the folder of a run
 FULL = "full"  # name of the scale whose runs lie in the folder itself
 
 
 class State(StrEnum):
-    """State of a run, found in its folder and in the journal."""
+    """State of a run, found in its folder."""
 
     FINISHED = "finished"
     INTERRUPTED = "interrupted"
@@ -29,57 +26,11 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Run:
-    """A training of the plan.
+    """A training of the plan."""
 
-    Attributes:
-        group: Group of the plan.
-        path: Its folder, relative to the folder of all runs.
-        options: Overrides of `scripts/train.py`, without folder.
-    """
-
-    group: str
-    path: str
-    options: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Session:
-    """A line of the journal.
-
-    Attributes:
-        run: Path of the run.
-        options: Its options.
-        end: "finished", "interrupted" or "failed".
-        seconds: Wall time of the session with data, training and evaluation [s].
-        cores: Number of cores of the process.
-    """
-
-    run: str
-    options: tuple[str, ...]
-    end: str
-    seconds: float
-    cores: int
-
-
-@dataclass(frozen=True)
-class RunTime:
-    """Wall time of a run over all of its sessions.
-
-    Attributes:
-        run: Path of the run; "total" for the sum.
-        sessions: Number of sessions.
-        end: End of the last session.
-        minutes: Wall time with data, training and evaluation [min].
-        training_minutes: Part of it that is the training [min]; None if unknown.
-        cores: Number of cores.
-    """
-
-    run: str
-    sessions: int
-    end: str
-    minutes: float
-    training_minutes: float | None
-    cores: int
+    group: str  # group of the plan
+    path: str  # its folder, relative to the folder of all runs
+    options: tuple[str, ...]  # overrides of `scripts/train.py`, without folder
 
 
 def planned(
@@ -117,13 +68,16 @@ def _group(
     for experiment in group["experiments"]:
         sizes = [*scale.get("all", ()), *scale.get(experiment, ())]
         folder = group.get("folder", experiment)
-        for own, options in group["runs"].items():
+        below: Mapping[str, Sequence[str]] = group.get("folders", {".": ()})
+        for (inner, special), (own, options) in itertools.product(
+            below.items(), group["runs"].items()
+        ):
             for values in itertools.product(*sweep.values()):
                 swept = [f"{key}={value}" for key, value in zip(sweep, values, strict=True)]
-                title = "-".join([own, *map(str, values)])
-                path = f"{folder}/{title}"
+                path = Path(folder, inner, "-".join([own, *map(str, values)])).as_posix()
                 own_sizes = [*sizes, *scale.get(path, ())]
-                every = [*with_experiment(experiment, options), *swept, *own_sizes, *more]
+                chosen = with_experiment(experiment, [*options, *special])
+                every = [*chosen, *swept, *own_sizes, *more]
                 yield Run(name, path, last_of_each_key(every))
 
 
@@ -140,73 +94,25 @@ def last_of_each_key(options: Sequence[str]) -> tuple[str, ...]:
     return tuple({option.partition("=")[0]: option for option in options}.values())
 
 
-def state(run: Run, root: Path, sessions: Sequence[Session]) -> State:
+def state(run: Run, root: Path) -> State:
     """Return the state of a run.
 
-    A run that the journal does not contain was trained by hand, and its options are not compared.
-
-    Args:
-        run: The run.
-        root: Folder of all runs.
-        sessions: Lines of the journal.
+    The options of a run that was trained by hand, whose folder has no `OPTIONS`, are not compared.
     """
     folder = root / run.path
     if not (folder / "config.yaml").is_file():
         return State.MISSING
-    own = [session for session in sessions if session.run == run.path]
-    if own and own[-1].options != run.options:
+    own = folder / OPTIONS
+    if own.is_file() and json.loads(own.read_text()) != list(run.options):
         return State.OTHER_OPTIONS
     finished = (folder / "evaluation.json").is_file()
     return State.FINISHED if finished else State.INTERRUPTED
 
 
-def read_journal(root: Path) -> list[Session]:
-    """Return the lines of the journal; a line that a crash has torn is left out."""
-    path = root / JOURNAL
-    found = []
-    for line in path.read_text().splitlines() if path.is_file() else ():
-        try:
-            row = json.loads(line)
-            found.append(Session(**{**row, "options": tuple(row["options"])}))
-        except (ValueError, TypeError, KeyError):
-            continue
-    return found
-
-
-def append(session: Session, root: Path) -> None:
-    """Append a line to the journal."""
-    root.mkdir(parents=True, exist_ok=True)
-    line = {**vars(session), "options": list(session.options)}
-    append_jsonl(root / JOURNAL, line)
-
-
-def times(runs: Sequence[Run], root: Path, sessions: Sequence[Session]) -> list[RunTime]:
-    """Return the wall times of the runs that the journal contains, and their sum."""
-    from benchmarks.methods import training_minutes
-
-    rows = []
-    for run in runs:
-        own = [one for one in sessions if one.run == run.path and one.options == run.options]
-        if own:
-            minutes = sum(one.seconds for one in own) / 60
-            training = training_minutes(root / run.path)
-            last = own[-1]
-            rows.append(RunTime(run.path, len(own), last.end, minutes, training, last.cores))
-    if rows:
-        ends = {row.end for row in rows}
-        finished = len(rows) == len(runs) and ends == {State.FINISHED.value}
-        known = [row.training_minutes for row in rows if row.training_minutes is not None]
-        rows.append(
-            RunTime(
-                "total",
-                sum(row.sessions for row in rows),
-                State.FINISHED if finished else State.INTERRUPTED,
-                sum(row.minutes for row in rows),
-                sum(known),
-                rows[-1].cores,
-            )
-        )
-    return rows
+def keep_options(run: Run, root: Path) -> None:
+    """Write the options of a run to its folder, if its training has made the folder."""
+    if (root / run.path).is_dir():
+        (root / run.path / OPTIONS).write_text(json.dumps(run.options) + "\n")
 
 
 def fits_in_one_step(folder: Path) -> bool:

@@ -9,13 +9,12 @@ from torch import Tensor
 
 from benchmarks.methods import Method
 from benchmarks.samples import solved
-from benchmarks.study import method_colours, picture
-from benchmarks.tables import read
+from benchmarks.study import dots, dots_legend, method_colours, picture, read
 from dpl import Sample, Scene
 from dpl.evaluation import latency
 from dpl.fem import Load, Newton
 from dpl.system.threads import one_thread
-from dpl.training import ErrorMetrics, relative_errors
+from dpl.training import ErrorMetrics
 
 # Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples. Experiments 3
 # and 3b differ in the range of Young's modulus, on which only networks with E as an input depend.
@@ -35,8 +34,6 @@ PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int | None]]
 STREAMS = {"twice": 4, "small": 5}  # of loads; those of samples and scales are below
 CORRECTED = " corrected"  # ends the name of a network that is corrected
 PLAIN = "_plain"  # ends the name of a network without the linear solution
-LEAST_DRAWN, MOST_DRAWN = 1e-9, 1e3  # errors beyond are drawn there [-]
-GOLDEN = 0.618034  # distance of successive dots across a row, modulo 1, in heights of a row
 TITLES = {
     "in range": "loads in range",
     "twice": "one to two times the range",
@@ -46,32 +43,19 @@ TITLES = {
 
 @dataclass(frozen=True)
 class Result:
-    """One method on one set of loads.
+    """One method on one set of loads."""
 
-    Attributes:
-        method: Its name.
-        loads: Name of the set: "in range", "twice" (one to two times the amplitude) or "small" (1
-            to 10 % of it).
-        count: Loads in the set.
-        samples: Solved loads that it learnt from.
-        generation_minutes: Wall time in which those were solved.
-        training_minutes: Wall time of the training, or of the making of a basis.
-        parameters: Numbers that were trained.
-        e_mean, e_max, SNR_min, rel_L2_median, rel_L2_worst, residual, min_det_F: See
-            `dpl.training.metrics`.
-        ms: Median latency of the bare network, see `dpl.evaluation.timing`: force in, displacement
-            out, nothing checked [ms].
-        ms_p99: 99th percentile of the same [ms].
-        newton_iterations: Mean iterations of Newton from it to the scene's tolerance, in range.
-    """
-
-    method: str
+    method: str  # its name
+    # name of the set: "in range", "twice" (one to two times the amplitude) or "small" (1 to 10 % of
+    # it)
     loads: str
-    count: int
-    samples: int | None = None
-    generation_minutes: float | None = None
-    training_minutes: float | None = None
-    parameters: int | None = None
+    count: int  # loads in the set
+    samples: int | None = None  # solved loads that it learnt from
+    generation_minutes: float | None = None  # wall time in which those were solved
+    training_minutes: float | None = None  # wall time of the training, or of the making of a basis
+    parameters: int | None = None  # numbers that were trained
+    # e_mean, e_max, SNR_min, rel_L2_median, rel_L2_worst, residual, min_det_F: See
+    # `dpl.training.metrics`
     e_mean: float | None = None
     e_max: float | None = None
     SNR_min: float | None = None
@@ -79,8 +63,11 @@ class Result:
     rel_L2_worst: float | None = None
     residual: float | None = None
     min_det_F: float | None = None
+    # median latency of the bare network, see `dpl.evaluation.timing`: force in, displacement out,
+    # nothing checked [ms]
     ms: float | None = None
-    ms_p99: float | None = None
+    ms_p99: float | None = None  # 99th percentile of the same [ms]
+    # mean iterations of Newton from it to the scene's tolerance, in range
     newton_iterations: float | None = None
 
 
@@ -88,11 +75,6 @@ def load_sets(scene: Scene, test: Sample, count: int = 50) -> dict[str, Sample]:
     """Return the test loads in range and further solved loads out of range.
 
     Loads that have no stable answer are left out.
-
-    Args:
-        scene: What is simulated.
-        test: Loads in range with the truth.
-        count: Loads of each other set.
     """
     sets = {"in range": test}
     part = torch.linspace(0, 1, count, dtype=torch.float64)
@@ -111,18 +93,11 @@ def measure(
     *,
     generation_minutes: float | None = None,
     repeats: int = 3,
-) -> Iterator[tuple[Result, Tensor]]:
-    """Yield a row and the relative L2 errors of the loads (S,), for each method and set of loads.
+) -> Iterator[Result]:
+    """Yield a row for each method and set of loads.
 
     Loads are predicted one at a time on one thread. Each method predicts all loads of a set in
     succession, as in use, so that its weights stay in the cache.
-
-    Args:
-        methods: Methods by name.
-        sets: Loads with their solutions, by name.
-        newton: Solver that continues from each prediction.
-        generation_minutes: Wall time of the generation of the samples [min].
-        repeats: Number of predictions of each load.
     """
     for title, batch in sets.items():
         singles = batch.load.unbatch()
@@ -135,7 +110,7 @@ def measure(
                 errors.update(answer, batch)
                 known = {field.name for field in fields(Result)}
                 numbers = {k: float(v) for k, v in errors.compute().items() if k in known}
-                row = Result(
+                yield Result(
                     method=name,
                     loads=title,
                     count=len(singles),
@@ -148,7 +123,6 @@ def measure(
                     newton_iterations=iterations,
                     **numbers,
                 )
-                yield row, relative_errors(answer, batch)
 
 
 def _iterations(newton: Newton, loads: Sequence[Load], guesses: Tensor) -> float:
@@ -175,15 +149,7 @@ def paper(experiment: str) -> list[Result]:
 
 
 def with_kept_rows(rows: Sequence[Result], path: Path) -> list[Result]:
-    """Return rows with those of other methods that a file has, in the order of the sets of loads.
-
-    Args:
-        rows: New rows.
-        path: File of earlier rows; may be missing.
-
-    Raises:
-        ValueError: The file has other columns.
-    """
+    """Return rows with those of other methods that a file has, ordered by the sets of loads."""
     measured = {row.method for row in rows}
     earlier = read(Result, path) if path.is_file() else []
     kept = [row for row in earlier if row.method not in measured]
@@ -191,29 +157,23 @@ def with_kept_rows(rows: Sequence[Result], path: Path) -> list[Result]:
     return sorted([*rows, *kept], key=lambda row: order.index(row.loads))
 
 
-def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
-    """Draw the relative error of each load as a dot, a row for each method, and the medians.
-
-    Args:
-        errors: Relative L2 errors (S,) by method and set; each set has a panel.
-        path: Path of the picture.
-    """
-    sets = list(dict.fromkeys(title for _, title in errors))
-    methods = list(dict.fromkeys(method for method, _ in errors))
-    families = {m: m.removesuffix(CORRECTED).removesuffix(PLAIN) for m in methods}
-    colours = method_colours(families.values())
-    with picture(path, 2.6 * len(sets) + 1.6, 0.3 * len(methods) + 1.0) as figure:
+def draw(rows: Sequence[Result], path: Path) -> None:
+    """Draw median and largest error of each method, a panel for each set of loads."""
+    methods = [name for name in dict.fromkeys(row.method for row in rows)]
+    known = {(row.method, row.loads): row for row in rows}
+    sets = list(dict.fromkeys(row.loads for row in rows))
+    colours = list(method_colours(methods).values())
+    with picture(path, 0.21 * len(methods) + 1.1) as figure:
         axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
         for ax, title in zip(axes, sets, strict=True):
-            for row, method in enumerate(methods):
-                colour = colours[families[method]]
-                values = errors[method, title].clamp(min=LEAST_DRAWN, max=MOST_DRAWN).cpu()
-                shift = 0.6 * (torch.arange(len(values)) * GOLDEN % 1 - 0.5)  # dots side by side
-                dots = {"color": colour, "ms": 3, "alpha": 0.35, "mew": 0}
-                ax.plot(values, row + shift, "o", **dots)
-                ax.plot([values.median()] * 2, [row - 0.4, row + 0.4], color=colour, lw=2)
+            own = [known.get((method, title)) for method in methods]
+            dots(
+                ax,
+                methods,
+                [row.rel_L2_median if row else None for row in own],
+                [row.rel_L2_worst if row else None for row in own],
+                colours,
+            )
             ax.set(xscale="log", xlabel="relative L2 error")
             ax.set_title(TITLES.get(title, title))
-            ax.grid(visible=True, axis="x")
-        axes[0].set_yticks(range(len(methods)), methods)
-        axes[0].invert_yaxis()
+        dots_legend(figure, "median of the loads", "largest")

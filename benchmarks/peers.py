@@ -22,66 +22,39 @@ import numpy as np
 import torch
 
 from benchmarks import blas_detection
-from dpl import Scene
+from dpl import Scene, fem
 from dpl.data.solving.solve import LoadKey
 from dpl.data.solving.worker_pool import solve_loads
-from dpl.fem import (
-    Box,
-    ConstantFibres,
-    FibreReinforced,
-    Guccione,
-    Load,
-    Material,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Solution,
-    Tag,
-    VolumetricK4,
-    box,
-    propeller,
-    solve,
-)
 from dpl.fem.linear import make_backend, select_backend
 
 
 @dataclass(frozen=True)
 class Case:
-    """A load on the beam.
+    """A load on the beam."""
 
-    Attributes:
-        law: Material of the beam.
-        size: Lengths of its sides [m].
-        young: Young's modulus [Pa].
-        force: Total force on the end face along -z [N].
-        tip: Displacement of the centre of the end face along x and z [m]; nine codes agree on it.
-    """
-
-    law: Material
-    size: tuple[float, float, float]
-    young: float
-    force: float
+    law: fem.Material  # material of the beam
+    size: tuple[float, float, float]  # lengths of its sides [m]
+    young: float  # Young's modulus [Pa]
+    force: float  # total force on the end face along -z [N]
+    # displacement of the centre of the end face along x and z [m]; nine codes agree on it
     tip: tuple[float, float]
 
-    def build(self) -> tuple[Problem, Load]:
-        """Return the beam and its load."""
-        mesh = box(self.size, [40, 10, 10])
-        problem = Problem.build(mesh, self.law, fixed=Plane(0, "min"))
+    def build(self, law: fem.Material | None = None) -> tuple[fem.Problem, fem.Load]:
+        """Return the beam, of another law if one is given, and its load."""
+        mesh = fem.box(self.size, [40, 10, 10])
+        problem = fem.Problem.build(mesh, law or self.law, fixed=fem.Plane(0, "min"))
         end = self.end(problem)
         force = torch.zeros(1, *problem.shape, dtype=torch.float64)
         force[0, end, 2] = -self.force / (len(end) * self.young * problem.length**2)
-        return problem, Load(force, torch.tensor([self.young], dtype=torch.float64))
+        return problem, fem.Load(force, torch.tensor([self.young], dtype=torch.float64))
 
     @staticmethod
-    def end(problem: Problem) -> torch.Tensor:
+    def end(problem: fem.Problem) -> torch.Tensor:
         """Return the nodes of the end face."""
         x = problem.points[:, 0]
         return torch.nonzero(x > x.max() - 1e-9).ravel()
 
-    def error(self, problem: Problem, solution: Solution) -> float:
+    def error(self, problem: fem.Problem, solution: fem.Solution) -> float:
         """Return the distance of the tip from the reference position, over L [-]."""
         tip = solution.displacement[0, self.end(problem)].mean(dim=0) * problem.length
         return self.tip_error(tip.tolist())
@@ -93,12 +66,12 @@ class Case:
 
 LONG, SHORT = (100.0, 25.0, 25.0), (1.0, 0.25, 0.25)
 CASES = {
-    "S1": Case(NeoHookeanLn(0.3), LONG, 4500.0, 20100.0, (-9.441053465963, -39.987831598531)),
-    "S1s": Case(NeoHookeanLn(0.3), LONG, 4500.0, 430.0, (-0.005639797755, -1.000492546995)),
+    "S1": Case(fem.NeoHookeanLn(0.3), LONG, 4500.0, 20100.0, (-9.441053465963, -39.987831598531)),
+    "S1s": Case(fem.NeoHookeanLn(0.3), LONG, 4500.0, 430.0, (-0.005639797755, -1.000492546995)),
     "S2": Case(
-        SaintVenantKirchhoff(0.3), LONG, 4500.0, 20100.0, (-10.060386181979, -40.012725689017)
+        fem.SaintVenantKirchhoff(0.3), LONG, 4500.0, 20100.0, (-10.060386181979, -40.012725689017)
     ),
-    "S3": Case(NeoHookeanLn(0.3), SHORT, 2.03e11, 1.95e7, (-0.005615149126, -0.099693236807)),
+    "S3": Case(fem.NeoHookeanLn(0.3), SHORT, 2.03e11, 1.95e7, (-0.005615149126, -0.099693236807)),
 }
 
 # Seconds on one core of an AMD Zen 5, set-up and compilation excluded, median of 3; measured for
@@ -121,19 +94,12 @@ PUBLISHED = {
 
 @dataclass(frozen=True)
 class Time:
-    """Median time of a task.
+    """Median time of a task."""
 
-    Attributes:
-        case: Name of the task.
-        seconds: Median wall time [s].
-        iterations: Mean number of Newton iterations; NaN where there are none.
-        note: Further numbers.
-    """
-
-    case: str
-    seconds: float
-    iterations: float = float("nan")
-    note: str = ""
+    case: str  # name of the task
+    seconds: float  # median wall time [s]
+    iterations: float = float("nan")  # mean number of Newton iterations; NaN where there are none
+    note: str = ""  # further numbers
 
 
 def median(task: Callable[[], object], repeats: int) -> float:
@@ -148,19 +114,15 @@ def median(task: Callable[[], object], repeats: int) -> float:
 
 
 def beams(linear: str, repeats: int) -> dict[str, Time]:
-    """Return the time of each case with a backend.
-
-    Raises:
-        ArithmeticError: A solution does not converge or misses the reference.
-    """
+    """Return the time of each case with a backend."""
     rows = {}
     for name, case in CASES.items():
         problem, load = case.build()
-        newton = Newton(problem, linear=linear)
-        answer = solve(newton, load)
+        newton = fem.Newton(problem, linear=linear)
+        answer = fem.solve(newton, load)
         if not answer.converged or (error := case.error(problem, answer)) > 1e-8:
             raise ArithmeticError(f"{name}: residual {float(answer.residual):.1e}, not the answer")
-        seconds = median(partial(solve, newton, load), repeats)
+        seconds = median(partial(fem.solve, newton, load), repeats)
         note = f"tip to {error:.0e} L, residual {float(answer.residual):.0e}"
         rows[name] = Time(f"dpl, {linear}", seconds, int(answer.iterations), note)
     return rows
@@ -171,15 +133,6 @@ def time_reference_code(python: str, program: Path, repeats: int) -> dict[str, T
 
     The program first lists its shared libraries. Where it uses the reference BLAS and Debian's
     OpenBLAS is installed, it runs with OpenBLAS; the notes name the BLAS.
-
-    Args:
-        python: The interpreter.
-        program: The script, see `benchmarks.programs`.
-        repeats: Timed solves of each case.
-
-    Raises:
-        OSError: There is no such Python, the program failed, its result is wrong, or its BLAS is
-            the reference implementation or unknown.
     """
     cases = {
         name: {
@@ -219,11 +172,7 @@ def time_reference_code(python: str, program: Path, repeats: int) -> dict[str, T
 def _run_program(
     python: str, program: Path, cases: Mapping[str, object], environment: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return the output of a program: its shared libraries and the times by case.
-
-    Raises:
-        OSError: There is no such Python, or the program failed.
-    """
+    """Return the output of a program: its shared libraries and the times by case."""
     done = subprocess.run(
         [python, str(program)],
         input=json.dumps(cases),
@@ -238,10 +187,21 @@ def _run_program(
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
+@dataclass(frozen=True)
+class EnergyAlone(fem.Material):
+    """A law that is the energy of another law and nothing else: derivatives are automatic."""
+
+    law: fem.Material
+
+    def energy(self, H: torch.Tensor) -> torch.Tensor:
+        """Return the energy density, see `Material.energy`."""
+        return self.law.energy(H)
+
+
 def pieces(repeats: int) -> list[Time]:
     """Return the times of the parts of a Newton iteration of case S1."""
     problem, load = CASES["S1"].build()
-    u = solve(Newton(problem, tol=1e-4), load).displacement
+    u = fem.solve(fem.Newton(problem, tol=1e-4), load).displacement
     gap = problem.update_strain_gap(None, 1.0, 0.1 * u)
     values = problem.linearise(u).tangent[0].numpy()
     right = problem.restrict(load.force[0])
@@ -252,6 +212,10 @@ def pieces(repeats: int) -> list[Time]:
         Time("the same, mixed points", median(partial(problem.linearise, u, gap), repeats)),
         Time("tangent, tensors", median(partial(problem.tangent, u), repeats)),
     ]
+    slow = CASES["S1"].build(EnergyAlone(problem.material))[0]
+    for name, call in (("residual", slow.evaluate), ("tangent and residual", slow.linearise)):
+        seconds = median(partial(call, u), repeats)
+        rows.append(Time(f"{name}, by the energy alone", seconds))
     for name in ("band32", "band", "pardiso", "superlu"):
         try:
             solver = make_backend(problem.pattern, name)
@@ -267,23 +231,22 @@ def pieces(repeats: int) -> list[Time]:
 
 def propeller_scene(linear: str = "auto", deflection: float = 0.055) -> Scene:
     """Return the propeller of NH-ln, fixed at its bore, with deflections up to L / 10."""
-    problem = Problem.build(propeller(), NeoHookeanLn(0.3), fixed=Tag("bore"))
-    newton = Newton(problem, linear=linear)
+    problem = fem.Problem.build(fem.propeller(), fem.NeoHookeanLn(0.3), fixed=fem.Tag("bore"))
+    newton = fem.Newton(problem, linear=linear)
     return Scene(
-        problem, ModalLoads(newton.linear_solver, n_modes=10, deflection=deflection), newton
+        problem, fem.ModalLoads(newton.linear_solver, n_modes=10, deflection=deflection), newton
     )
 
 
-def beam_scene(law: Material | Mapping[str, Material], **options: Any) -> Scene:
-    """Return the paper's beam with its loads, deflections up to 0.4 L.
-
-    Args:
-        law: The law, or the laws of regions.
-        options: Options of `Problem.build`.
-    """
-    problem = Problem.build(box(LONG, [40, 10, 10]), law, fixed=Plane(0, "min"), **options)
-    newton = Newton(problem)
-    return Scene(problem, ModalLoads(newton.linear_solver, deflection=0.4, young=4500.0), newton)
+def beam_scene(law: fem.Material | Mapping[str, fem.Material], **options: Any) -> Scene:
+    """Return the paper's beam with its loads, deflections up to 0.4 L."""
+    problem = fem.Problem.build(
+        fem.box(LONG, [40, 10, 10]), law, fixed=fem.Plane(0, "min"), **options
+    )
+    newton = fem.Newton(problem)
+    return Scene(
+        problem, fem.ModalLoads(newton.linear_solver, deflection=0.4, young=4500.0), newton
+    )
 
 
 def fibre_scene() -> Scene:
@@ -291,10 +254,10 @@ def fibre_scene() -> Scene:
 
     Each load has its own stiffness of the fibres, 0.1 to 1, and bulk modulus, 10 to 1e4.
     """
-    law = FibreReinforced(
-        VolumetricK4({"low": 10.0, "high": 1e4, "distribution": "log"}),
-        Guccione({"low": 0.1, "high": 1.0, "distribution": "log"}, 8.0, 2.0, 4.0),
-        ConstantFibres([2.0, 1.0, 0.0]),
+    law = fem.FibreReinforced(
+        fem.VolumetricK4({"low": 10.0, "high": 1e4, "distribution": "log"}),
+        fem.Guccione({"low": 0.1, "high": 1.0, "distribution": "log"}, 8.0, 2.0, 4.0),
+        fem.ConstantFibres([2.0, 1.0, 0.0]),
     )
     return beam_scene(law, mean_dilatation=True)
 
@@ -302,17 +265,17 @@ def fibre_scene() -> Scene:
 def inclusion_scene() -> Scene:
     """Return the paper's beam with a core, 1 to 1,000 times as stiff, another one for each load."""
     stiff = {"low": 1.0, "high": 1e3, "distribution": "log"}
-    laws = {"core": NeoHookeanLn(0.3, stiff), "other": NeoHookeanLn(0.3)}
-    return beam_scene(laws, regions={"core": Box([25.0, 7.5, 7.5], [75.0, 17.5, 17.5])})
+    laws = {"core": fem.NeoHookeanLn(0.3, stiff), "other": fem.NeoHookeanLn(0.3)}
+    return beam_scene(laws, regions={"core": fem.Box([25.0, 7.5, 7.5], [75.0, 17.5, 17.5])})
 
 
 def propellers(linear: str, loads: int) -> Time:
     """Return the median time of a random load on the propeller."""
     scene = propeller_scene(linear)
     batch = scene.loads.sample(0, range(loads))
-    singles = [Load(batch.force[k : k + 1], batch.young[k : k + 1]) for k in range(loads)]
-    solve(scene.solver, singles[0])
-    answers = [solve(scene.solver, load) for load in singles]
+    singles = [fem.Load(batch.force[k : k + 1], batch.young[k : k + 1]) for k in range(loads)]
+    fem.solve(scene.solver, singles[0])
+    answers = [fem.solve(scene.solver, load) for load in singles]
     seconds = statistics.median(float(answer.seconds) for answer in answers)
     reached = sorted(float(a.displacement.norm(dim=-1).max()) for a in answers)
     good = sum(bool(a.converged) for a in answers)
@@ -324,13 +287,13 @@ def propellers(linear: str, loads: int) -> Time:
 
 def large(linear: str) -> Time:
     """Return the time of one Newton iteration on 100,548 degrees of freedom, and its memory."""
-    mesh = box([1.0, 0.25, 0.25], [76, 21, 21])
-    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"))
-    newton = Newton(problem, linear=linear, tol=1e-8)
+    mesh = fem.box([1.0, 0.25, 0.25], [76, 21, 21])
+    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), fixed=fem.Plane(0, "min"))
+    newton = fem.Newton(problem, linear=linear, tol=1e-8)
     force = torch.zeros(1, *problem.shape, dtype=torch.float64)
     end = Case.end(problem)
     force[0, end, 2] = -1e-4 / len(end)
-    states = newton.iterate(Load(force, torch.ones(1, dtype=torch.float64)))
+    states = newton.iterate(fem.Load(force, torch.ones(1, dtype=torch.float64)))
     start = time.perf_counter()
     next(states), next(states)
     first = time.perf_counter() - start
@@ -351,41 +314,23 @@ def large(linear: str) -> Time:
 
 @dataclass(frozen=True)
 class Robustness:
-    """Random loads of a body that are solved; iterations and times are of loads in one step.
+    """Random loads of a body that are solved; iterations and times are of loads in one step."""
 
-    Attributes:
-        body: Name of the body.
-        loads: Number of loads.
-        in_one_step: Number of loads that are solved in one load step.
-        with_load_steps: Number of loads that are solved in one load step or more.
-        no_stable_solution: Number of loads for which the solver states a reason, and no solution.
-        iterations: Mean number of iterations.
-        seconds: Median wall time [s].
-        min_det_F: Smallest det F [-].
-        largest_deflection: Largest nodal displacement over L [-].
-    """
-
-    body: str
-    loads: int
-    in_one_step: int
-    with_load_steps: int
-    no_stable_solution: int
-    iterations: float
-    seconds: float
-    min_det_F: float
-    largest_deflection: float
+    body: str  # name of the body
+    loads: int  # number of loads
+    in_one_step: int  # number of loads that are solved in one load step
+    with_load_steps: int  # number of loads that are solved in one load step or more
+    no_stable_solution: int  # number of loads for which the solver states a reason, and no solution
+    iterations: float  # mean number of iterations
+    seconds: float  # median wall time [s]
+    min_det_F: float  # smallest det F [-]
+    largest_deflection: float  # largest nodal displacement over L [-]
 
 
 def robustness(
     scenes: Mapping[str, Callable[[], Scene]], loads: int, workers: int
 ) -> Iterator[Robustness]:
-    """Yield how many random loads of each scene are solved, in one step and with load steps.
-
-    Args:
-        scenes: Functions that build the scenes, by name.
-        loads: Number of loads of each scene.
-        workers: Number of worker processes.
-    """
+    """Yield how many random loads of each scene are solved, in one step and with load steps."""
     for name, build in scenes.items():
         scene = build()
         once = replace(scene, solver=replace(scene.newton, min_load_step=0.9))

@@ -23,57 +23,33 @@ STATES = 256  # evenly spaced snapshots from which the cells are chosen
 
 
 class Reduced(NamedTuple):
-    """Solution in reduced coordinates.
+    """Solution in reduced coordinates."""
 
-    Attributes:
-        displacement: Displacement over L, (N, D) [-].
-        residual: Reduced relative residual under the whole load [-].
-        load_factor: Part of the load for which a reduced equilibrium was found [-].
-    """
-
-    displacement: Tensor
-    residual: float
-    load_factor: float
+    displacement: Tensor  # displacement over L, (N, D) [-]
+    residual: float  # reduced relative residual under the whole load [-]
+    load_factor: float  # part of the load for which a reduced equilibrium was found [-]
 
 
 class _Load(NamedTuple):
-    """A load in reduced coordinates.
+    """A load in reduced coordinates."""
 
-    Attributes:
-        force: W^T f, (R,).
-        scale: Norm of the residual at rest.
-        offset: Displacement to which the subspace adds at full load, (N, D).
-        cell_offset: Offset at the cells' nodes, (C A D,).
-        offset_error: Difference of `force` and W^T K(0) offset of the cells, (R,).
-    """
-
-    force: Tensor
-    scale: float
-    offset: Tensor
-    cell_offset: Tensor
-    offset_error: Tensor
+    force: Tensor  # W^T f, (R,)
+    scale: float  # norm of the residual at rest
+    offset: Tensor  # displacement to which the subspace adds at full load, (N, D)
+    cell_offset: Tensor  # offset at the cells' nodes, (C A D,)
+    offset_error: Tensor  # difference of `force` and W^T K(0) offset of the cells, (R,)
 
 
 class _State(NamedTuple):
-    """An evaluated iterate.
+    """An evaluated iterate."""
 
-    Attributes:
-        y: Coordinates in W, (R,).
-        factor: Part of the offset that is applied [-].
-        cell_displacement: Displacement of the cells, (1, C A, D).
-        internal: Reduced internal force, (R,).
-        volume_ratio: min det F of the cells [-].
-        length: Length of the step that led here, 1 for a full one.
-        gap: Strain gap of the mixed integration points, see `Problem.update_strain_gap`.
-    """
-
-    y: Tensor
-    factor: float
-    cell_displacement: Tensor
-    internal: Tensor
-    volume_ratio: float
-    length: float = 1.0
-    gap: Any = None
+    y: Tensor  # coordinates in W, (R,)
+    factor: float  # part of the offset that is applied [-]
+    cell_displacement: Tensor  # displacement of the cells, (1, C A, D)
+    internal: Tensor  # reduced internal force, (R,)
+    volume_ratio: float  # min det F of the cells [-]
+    length: float = 1.0  # length of the step that led here, 1 for a full one
+    gap: Any = None  # strain gap of the mixed integration points, see `Problem.update_strain_gap`
 
 
 class PODGalerkin:
@@ -124,10 +100,6 @@ class PODGalerkin:
             snapshots: Displacements in equilibrium, (S, N, D) [-].
             rank: Dimension R of the subspace.
             tolerance: Relative error of their reduced forces [-], see `cubature`.
-
-        Raises:
-            ValueError: `rank` is out of range, see `pod`, or the body has ranges, follower loads or
-                rigid body modes.
         """
         for name, ends in problem.material.parameter_ranges.items():
             raise ValueError(
@@ -241,14 +213,7 @@ class PODGalerkin:
     def _tangent(
         self, load: _Load, state: _State, target: float, jump: float
     ) -> tuple[Tensor | None, Tensor]:
-        """Return the inverse tangent, None if singular, and the right-hand side of a step.
-
-        Args:
-            load: The load.
-            state: The state.
-            target: Load factor.
-            jump: Part of the offset that the step adds.
-        """
+        """Return the inverse tangent, None if singular, and the right-hand side of a step."""
         cells = self.cells
         if state.factor == 0 and not state.y.any():  # at rest: K(0) and the linear solution
             return self._identity, torch.zeros_like(state.y)

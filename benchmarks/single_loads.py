@@ -1,4 +1,4 @@
-"""One large load: errors of all networks and a figure of the deformed shapes."""
+"""One large load: errors of all networks beside those of the paper."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dpl import Sample, Scene
+from benchmarks.study import dots, method_colours, picture
+from dpl import Sample
 from dpl.inference.hybrid import Predict
 from dpl.system.threads import one_thread
 from dpl.training import metrics
-from dpl.visualization import plot_deformed
 
 # Odot, Haferssas, Cotin (2022), tables 2, 4 and 6: e_mean, e_max, SNR [dB]
 PAPER: dict[str, dict[str, tuple[float, float, float]]] = {
@@ -40,25 +40,15 @@ PAPER: dict[str, dict[str, tuple[float, float, float]]] = {
 
 @dataclass(frozen=True)
 class SingleLoad:
-    """Errors of one method for one load.
+    """Errors of one method for one load."""
 
-    Attributes:
-        method: Name of the method.
-        load: Number of the test load; None for the loads of the paper.
-        deflection: Largest nodal displacement over L [-].
-        e_mean: Norm of the error over the number of degrees of freedom [-].
-        e_max: Largest nodal error over L [-].
-        SNR: Signal-to-noise ratio [dB].
-        rel_L2: Norm of the error over that of the displacement [-].
-    """
-
-    method: str
-    load: int | None = None
-    deflection: float | None = None
-    e_mean: float | None = None
-    e_max: float | None = None
-    SNR: float | None = None
-    rel_L2: float | None = None
+    method: str  # name of the method
+    load: int | None = None  # number of the test load; None for the loads of the paper
+    deflection: float | None = None  # largest nodal displacement over L [-]
+    e_mean: float | None = None  # norm of the error over the number of degrees of freedom [-]
+    e_max: float | None = None  # largest nodal error over L [-]
+    SNR: float | None = None  # signal-to-noise ratio [dB]
+    rel_L2: float | None = None  # norm of the error over that of the displacement [-]
 
 
 def largest_displacements(test: Sample) -> Tensor:
@@ -71,16 +61,8 @@ def choose(test: Sample, deflection: float) -> int:
     return int((largest_displacements(test) - deflection).abs().argmin())
 
 
-def measure(
-    predictions: Mapping[str, Predict], test: Sample, load: int
-) -> tuple[list[SingleLoad], dict[str, Tensor]]:
-    """Return a row and the displacement (1, N, D) [-] of each method for one load.
-
-    Args:
-        predictions: Functions from a load to displacements, by name.
-        test: Test loads with their solutions.
-        load: Number of the load.
-    """
+def measure(predictions: Mapping[str, Predict], test: Sample, load: int) -> list[SingleLoad]:
+    """Return a row of each method for one load."""
     single = Sample(*(column[load : load + 1] for column in test))
     deflection = float(largest_displacements(single))
     errors = (
@@ -89,13 +71,13 @@ def measure(
         metrics.signal_to_noise,
         metrics.relative_errors,
     )
-    rows, displacements = [], {}
+    rows = []
     with one_thread(), torch.inference_mode():
         for name, predict in predictions.items():
-            found = displacements[name] = predict(single.load)
+            found = predict(single.load)
             numbers = (float(error(found, single)) for error in errors)
             rows.append(SingleLoad(name, load, deflection, *numbers))
-    return rows, displacements
+    return rows
 
 
 def paper(experiment: str) -> list[SingleLoad]:
@@ -106,31 +88,11 @@ def paper(experiment: str) -> list[SingleLoad]:
     ]
 
 
-def draw(
-    scene: Scene,
-    test: Sample,
-    displacements: Mapping[str, Tensor],
-    rows: Sequence[SingleLoad],
-    path: Path,
-) -> None:
-    """Draw the deformed shapes.
-
-    Shapes are coloured by the nodal error on logarithmic scales.
-
-    Args:
-        scene: The scene.
-        test: Test loads with their solutions.
-        displacements: Displacements of the methods, (1, N, D) [-].
-        rows: Rows of `paper` and `measure`, all measured ones of one load.
-        path: Path of the picture.
-    """
-    measured = {row.method: row for row in rows if row.load is not None}
-    load = next(row.load for row in rows if row.load is not None)
-    shown = [
-        (f"{name}: relative L2 {measured[name].rel_L2:.1e}", field)
-        for name, field in displacements.items()
-    ]
-    figure = plot_deformed(
-        scene.problem, test.displacement[load : load + 1], shown, upright=True, logarithmic=True
-    )
-    figure.savefig(path)
+def draw(rows: Sequence[SingleLoad], path: Path) -> None:
+    """Draw the signal-to-noise ratio of each method and of the loads of the paper."""
+    with picture(path, 0.21 * len(rows) + 0.8) as figure:
+        ax = figure.subplots()
+        names = [row.method for row in rows]
+        colours = list(method_colours(names).values())
+        dots(ax, names, [row.SNR for row in rows], [None] * len(rows), colours)
+        ax.set(xlabel="signal-to-noise ratio of one load [dB]", xlim=(0, None))

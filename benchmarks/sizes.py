@@ -8,13 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from benchmarks.discretisation import BEAM, YOUNG
-from benchmarks.study import method_colours, picture
+from benchmarks.study import METHOD_COLOURS, OTHER_COLOURS, picture
 from dpl import Sample, Scene
 from dpl.evaluation import latency
 from dpl.fem import LinearSolver, Load, ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, solve
@@ -26,23 +25,14 @@ from dpl.training import MSE, Surrogate
 
 @dataclass(frozen=True)
 class Size:
-    """Cost of a method on a beam.
+    """Cost of a method on a beam."""
 
-    Attributes:
-        case: Name of the method.
-        dofs: Degrees of freedom, fixed ones included.
-        ms: Median wall time on one thread [ms].
-        parameters: Number of parameters of the network.
-        memory_mb: Memory of weights or factors [MB]; None if not measured.
-        peak_memory_mb: Peak memory of the process that measured this beam [MB].
-    """
-
-    case: str
-    dofs: int
-    ms: float
-    parameters: int | None = None
-    memory_mb: float | None = None
-    peak_memory_mb: float | None = None
+    case: str  # name of the method
+    dofs: int  # degrees of freedom, fixed ones included
+    ms: float  # median wall time on one thread [ms]
+    parameters: int | None = None  # number of parameters of the network
+    memory_mb: float | None = None  # memory of weights or factors [MB]; None if not measured
+    peak_memory_mb: float | None = None  # peak memory of the process that measured this beam [MB]
 
 
 def sizes(
@@ -120,16 +110,15 @@ def exponent(dofs: Sequence[float], costs: Sequence[float]) -> float:
     return float(np.polyfit(np.log(dofs), np.log(costs), 1)[0])
 
 
-LINES = {  # start of a case: its short name and its method, which determines the colour
-    "factor of K(0)": ("factor of K(0)", "factor of K(0)"),
-    "process": ("whole process, peak", "process"),
-    "linear solution": ("linear", "linear"),
-    "Newton, corotational": ("Newton from a prediction", "corotational"),
-    "Newton": ("Newton", "Newton"),
-    "unrolled": ("unrolled", "unrolled"),
-    "fcnn": ("fcnn", "fcnn"),
+LINES = {  # start of a case: its short name, and its colour
+    "factor of K(0)": ("factor of K(0)", OTHER_COLOURS[0]),
+    "process": ("whole process, peak", OTHER_COLOURS[1]),
+    "linear solution": ("linear", METHOD_COLOURS["linear"]),
+    "Newton, corotational": ("Newton from a prediction", OTHER_COLOURS[2]),
+    "Newton": ("Newton", METHOD_COLOURS["Newton"]),
+    "unrolled": ("unrolled", METHOD_COLOURS["unrolled"]),
+    "fcnn": ("fcnn", METHOD_COLOURS["fcnn"]),
 }
-LABEL_SPACE = 0.15  # part of the axis to the right of the last point, for labels of lines
 PANELS = (  # label, field, drawn lines; each panel has at most four of them
     ("time of one solution [ms]", "ms", ("factor", "linear", "Newton")),
     ("time of one prediction [ms]", "ms", ("unrolled", "fcnn")),
@@ -140,29 +129,28 @@ PANELS = (  # label, field, drawn lines; each panel has at most four of them
 
 def draw(rows: Sequence[Size], path: Path) -> None:
     """Draw times, parameters and memory against degrees of freedom, with the exponents of fits."""
-    colours = method_colours([method for _, method in LINES.values()])
     whole = [replace(row, case="process", memory_mb=row.peak_memory_mb) for row in rows]
     families: dict[str, dict[int, Size]] = {}
     for row in [*rows, *whole]:
         start = next(start for start in LINES if row.case.startswith(start))
         families.setdefault(start, {})[row.dofs] = row
-    with picture(path, 8.4, 6.2) as figure:
-        for ax, (label, field, starts) in zip(figure.subplots(2, 2).flat, PANELS, strict=True):
+    with picture(path, 5.6) as figure:
+        axes = figure.subplots(2, 2, sharex=True).flat
+        for ax, (label, field, starts) in zip(axes, PANELS, strict=True):
             for start in (start for start in families if start.startswith(starts)):
                 family = families[start].values()
                 known = [(row.dofs, value) for row in family if (value := getattr(row, field))]
                 if known:
-                    name, method = LINES[start]
-                    _draw_line(ax, known, name, colours[method])
-            ax.set(xscale="log", yscale="log", xlabel="degrees of freedom", ylabel=label)
-            least, most = min(row.dofs for row in rows), max(row.dofs for row in rows)
-            ax.set_xlim(least / 1.3, most * (most / least) ** LABEL_SPACE)
+                    name, colour = LINES[start]
+                    power = exponent(*zip(*known, strict=True))
+                    words = f"{name}: power {power:.1f}" if power == power else name
+                    ax.loglog(
+                        *zip(*known, strict=True), "o-", ms=3.5, lw=1.2, color=colour, label=words
+                    )
+            ax.set_ylabel(label)
+            if ax.get_subplotspec().is_last_row():
+                ax.set_xlabel("degrees of freedom")
+            low, high = np.log10(ax.get_ylim())
+            ax.set_ylim(top=10 ** (high + 0.12 * len(ax.lines) * (high - low)))  # of the legend
             ax.grid(visible=True)
-
-
-def _draw_line(ax: Any, known: Sequence[tuple[int, float]], name: str, colour: str) -> None:
-    x, y = zip(*known, strict=True)
-    label = f"{name} $\\sim$ DOFs$^{{{exponent(x, y):.2f}}}$" if len(x) > 1 else name
-    ax.plot(x, y, "o-", ms=3.5, lw=1.2, color=colour)
-    place = {"xytext": (6, 0), "textcoords": "offset points", "va": "center", "fontsize": 7.5}
-    ax.annotate(label, (x[-1], y[-1]), color=colour, **place)
+            ax.legend(loc="upper left")

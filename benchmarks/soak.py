@@ -11,6 +11,7 @@ from pathlib import Path
 import lightning as L
 import torch
 
+from benchmarks.study import OTHER_COLOURS, picture
 from dpl import Scene
 from dpl.inference import Simulator
 
@@ -25,25 +26,15 @@ FILE_GROWTH = 0.1  # largest relative growth of open files; batches open and clo
 
 @dataclass(frozen=True)
 class Usage:
-    """Resources of a process and its descendants at one time.
+    """Resources of a process and its descendants at one time."""
 
-    Attributes:
-        workload: Name of the work.
-        seconds: Time since the start [s].
-        steps: Answers or training steps so far.
-        memory: Proportional set size of all processes [MB].
-        files: Open files, segments of shared memory included.
-        processes: Number of processes.
-        shm_segments: Named segments of shared memory, which outlive a killed process.
-    """
-
-    workload: str
-    seconds: float
-    steps: int
-    memory: float
-    files: int
-    processes: int
-    shm_segments: int
+    workload: str  # name of the work
+    seconds: float  # time since the start [s]
+    steps: int  # answers or training steps so far
+    memory: float  # proportional set size of all processes [MB]
+    files: int  # open files, segments of shared memory included
+    processes: int  # number of processes
+    shm_segments: int  # named segments of shared memory, which outlive a killed process
 
 
 def usage(workload: str, seconds: float, steps: int) -> Usage:
@@ -87,11 +78,6 @@ def simulator(sim: Simulator, seconds: float, *, every: float = 5.0) -> Iterator
 
     Network, tolerances, budgets, warm starts and invalid forces alternate. The loads repeat after
     `BATCH` times the number of calls.
-
-    Args:
-        sim: A simulator.
-        seconds: Duration [s].
-        every: Time between two records [s].
     """
     calls = list(_calls(sim))
     newtons = _loads(sim.scene)
@@ -174,9 +160,6 @@ def regressions(rows: Sequence[Usage]) -> list[str]:
     """Return growth of resources and loss of speed in the second half, one line each.
 
     Buffers, caches and compiled kernels fill in the first half.
-
-    Raises:
-        ValueError: There are fewer than ten rows.
     """
     if len(rows) < 10:
         raise ValueError(f"{len(rows)} records must be 10 or more; increase minutes")
@@ -223,15 +206,11 @@ def summary(rows: Sequence[Usage]) -> str:
 
 def draw(rows: Sequence[Usage], path: Path) -> None:
     """Draw memory, rate, open files and processes against time, one line per workload."""
-    from benchmarks.verification.drawing import panel, picture
-    from dpl.visualization import COLOURS
-
     workloads = list(dict.fromkeys(row.workload for row in rows))
-    with picture(path, 3.4) as figure:
-        memory = panel(figure, 1, "time [min]", "memory [MB]", "(a)", columns=3)
-        rate = panel(figure, 2, "time [min]", "answers or steps a second", "(b)", columns=3)
-        counts = panel(figure, 3, "time [min]", "open files; processes", "(c)", columns=3)
-        for colour, workload in zip(COLOURS, workloads, strict=False):
+    with picture(path, 3.0) as figure:
+        axes = figure.subplots(1, 3, sharex=True)
+        memory, rate, counts = axes
+        for colour, workload in zip(("0.25", OTHER_COLOURS[2]), workloads, strict=False):
             own = [row for row in rows if row.workload == workload]
             minutes = [row.seconds / 60 for row in own]
             memory.plot(minutes, [row.memory for row in own], color=colour, label=workload)
@@ -240,6 +219,9 @@ def draw(rows: Sequence[Usage], path: Path) -> None:
             rate.plot(minutes[span:], rates, color=colour)
             counts.plot(minutes, [row.files for row in own], color=colour)
             counts.plot(minutes, [row.processes for row in own], color=colour, linestyle="--")
-        for ax in (memory, rate, counts):
+        labels = "memory [MB]", "answers or steps a second", "open files (-), processes (- -)"
+        for ax, label in zip(axes, labels, strict=True):
+            ax.set(xlabel="time [min]", title=label)
             ax.set_ylim(bottom=0)
-        figure.legend(*memory.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+            ax.grid(visible=True)
+        figure.legend(loc="outside lower center", ncols=2)

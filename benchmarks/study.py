@@ -1,18 +1,23 @@
-"""What all studies do with their rows: write, print and draw them."""
+"""What all studies do with their rows: write, print, read and draw them."""
 
+import csv
+import io
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import json
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
-from benchmarks.tables import read, write_machine
-from dpl.evaluation.tables import show, write
+import numpy as np
+from numpy.typing import NDArray
+
+from dpl.evaluation.tables import machine, show, write
 from dpl.visualization import COLOURS, DPI, STYLE
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+Array = NDArray[np.float64]
 Row = TypeVar("Row")
 Draw = Callable[[Sequence[Row], Path], None]
 METHOD_COLOURS = {  # a method has the same colour in all figures
@@ -24,14 +29,30 @@ METHOD_COLOURS = {  # a method has the same colour in all figures
     "cnn": COLOURS[3],
     "gnn": COLOURS[4],
     "POD-Galerkin": COLOURS[5],
+    "paper": "#7F3C8D",
 }
-OTHER_COLOURS = ("#7F3C8D", "#A5AA99", "#80BA5A", "#E73F74")  # of methods without an own colour
+OTHER_COLOURS = ("#A5AA99", "#80BA5A", "#E73F74", "#8C564B")  # of methods without an own colour
+WIDTH = 7.4  # of all figures [inch]: 7.5 points are 10 pixels on a page with pictures of 700 pixels
+READERS: dict[Any, Callable[[str], Any]] = {
+    str: str,
+    int: int,
+    float: lambda cell: float(cell or "nan"),
+    bool: lambda cell: cell == "True",
+    int | None: lambda cell: int(cell) if cell else None,
+    float | None: lambda cell: float(cell) if cell else None,
+    tuple[int, ...]: lambda cell: tuple(int(part) for part in cell.strip("()").split(",") if part),
+}
 
 
 def method_colours(names: Iterable[str]) -> dict[str, str]:
-    """Return the colours of methods by name: those of `METHOD_COLOURS`, else further ones."""
+    """Return the colours of methods by name: those of `METHOD_COLOURS`, else further ones.
+
+    Variants of a method, such as fcnn_plain and "fcnn, hybrid", have its colour.
+    """
     others = itertools.cycle(OTHER_COLOURS)
-    return {name: METHOD_COLOURS.get(name) or next(others) for name in names}
+    methods = {name: re.split(r"[_, ]", name, maxsplit=1)[0] for name in names}
+    own = {one: METHOD_COLOURS.get(one) or next(others) for one in dict.fromkeys(methods.values())}
+    return {name: own[method] for name, method in methods.items()}
 
 
 def record(
@@ -41,6 +62,7 @@ def record(
     draw: Draw[Row] | None = None,
     *,
     threads: int = 1,
+    facts: Mapping[str, str | int | None] = {},  # not changed
 ) -> list[Row]:
     """Write rows as CSV, each as soon as it is measured; print them; write machine and figure.
 
@@ -50,9 +72,7 @@ def record(
         title: Title of the printed table; None: the rows are not printed.
         draw: Draws the rows to a path; None: there is no figure.
         threads: Number of threads of the measurement, for the record.
-
-    Returns:
-        The rows.
+        facts: Further facts about the machine, for the record.
     """
     measured: list[Row] = []
     for row in rows:
@@ -61,39 +81,104 @@ def record(
     if measured:
         if title is not None:
             show(measured, title)
-        write_machine(stem.with_name(f"{stem.name}.json"), threads=threads)
+        write_machine(stem.with_name(f"{stem.name}.json"), threads=threads, **facts)
         if draw is not None:
             draw(measured, stem.with_name(f"{stem.name}.png"))
         print(f"written to {stem}.csv", flush=True)
     return measured
 
 
-def redraw(kind: type[Row], path: Path, draw: Draw[Row], *, stem: str | None = None) -> None:
-    """Draw the rows of a CSV file to the picture beside it, if there is such a file.
+def read(kind: type[Row], path: Path) -> list[Row]:
+    """Return the rows of a CSV file written by `write`, whose dataclass has fields of `READERS`."""
+    readers = {name: READERS[hint] for name, hint in get_type_hints(kind).items()}
+    with path.open(newline="") as file:
+        lines = csv.DictReader(file)
+        if lines.fieldnames != list(readers):
+            raise ValueError(f"{path} must have the columns {', '.join(readers)}")
+        return [kind(**{name: readers[name](cell) for name, cell in row.items()}) for row in lines]
 
-    Args:
-        kind: Class of the rows.
-        path: The file.
-        draw: Draws the rows to a path.
-        stem: Name of the picture without extension; None: that of the file.
-    """
-    if path.is_file():
-        draw(read(kind, path), path.with_name(f"{stem or path.stem}.png"))
+
+def write_machine(path: Path, **facts: str | int | None) -> None:
+    """Write the name of the machine and further facts as JSON."""
+    path.write_text(json.dumps({"machine": machine(), **facts}) + "\n")
 
 
 @contextmanager
-def picture(path: Path, width: float, height: float) -> Iterator["Figure"]:
-    """Yield an empty figure in the style of the package and write it to a file at the end.
-
-    Args:
-        path: Path of the picture.
-        width, height: Size [inch].
-    """
+def picture(path: Path, height: float = 3.1) -> Iterator[Any]:
+    """Yield an empty figure of page width, and of a height [inch]; write it at the end."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
+    from PIL import Image
 
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
+        figure = Figure(figsize=(WIDTH, height))
+        figure.set_layout_engine("constrained", w_pad=0.06, wspace=0.05)
         yield figure
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI)
+        drawn = io.BytesIO()
+        figure.savefig(drawn, dpi=DPI)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    palette = Image.open(drawn).convert("RGB").quantize(128)  # a third of the size
+    palette.save(path, optimize=True)
+
+
+def dots(
+    ax: Any,
+    names: Sequence[str],
+    filled: Sequence[float | None],
+    hollow: Sequence[float | None],
+    colours: Sequence[str],
+) -> None:
+    """Draw a row for each name: a filled and a hollow dot, each where its value is known."""
+    for row, (*pair, colour) in enumerate(zip(filled, hollow, colours, strict=True)):
+        known = [value for value in pair if value is not None and math.isfinite(value)]
+        ax.plot(known, [row] * len(known), color=colour, lw=0.8, alpha=0.5)
+        for value, face in zip(pair, (colour, "white"), strict=True):
+            if value is not None:
+                ax.plot(value, row, "o", color=colour, mfc=face, ms=4.5)
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    ax.tick_params(axis="y", length=0)
+    ax.grid(visible=True)
+
+
+def dots_legend(figure: Any, filled: str, hollow: str) -> None:
+    """Explain the dots of `dots` below a figure."""
+    from matplotlib.lines import Line2D
+
+    style: dict[str, Any] = {"color": "0.4", "marker": "o", "ls": "", "ms": 4.5}
+    faces = {filled: "0.4", hollow: "white"}
+    handles = [Line2D([], [], mfc=face, label=words, **style) for words, face in faces.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+
+
+def place_labels(ax: Any, labels: Sequence[Any]) -> None:
+    """Move annotations of points next to them, where they cover no line, point or other label.
+
+    Candidates are places around the point, on two squares. That with the fewest covered places
+    counts, then the nearest.
+    """
+    ax.figure.draw_without_rendering()
+    pixel = ax.figure.dpi / 72
+    gap, places = 5 * pixel, []
+    for line in ax.lines:
+        ends = ax.transData.transform(line.get_xydata())
+        places += [ends, *(np.linspace(a, b, 50) for a, b in itertools.pairwise(ends))]
+    spots = np.concatenate(places)
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ring /= np.abs(ring).max(axis=1, keepdims=True)
+    placed: list[tuple[Array, Array]] = []  # centres and half sizes
+    for label in labels:
+        extent, at = label.get_window_extent(), ax.transData.transform(label.xy)
+        half = np.array([extent.width, extent.height]) / 2
+        best: tuple[float, Array] | None = None
+        for centre in (at + far * (half + 1.5 * gap) * one for far in (1.0, 1.5) for one in ring):
+            cost = np.linalg.norm(centre - at) / 100 / gap
+            cost += (np.abs(spots - centre) < half + 0.6 * gap).all(axis=1).sum()
+            cost += 1000 * sum((np.abs(centre - c) < half + h).all() for c, h in placed)
+            cost += 1000 * (not ax.bbox.x0 < centre[0] - half[0] < ax.bbox.x1 - 2 * half[0])
+            if best is None or cost < best[0]:
+                best = float(cost), centre
+        assert best is not None
+        label.set_position((best[1] - at) / pixel)
+        placed.append((best[1], half))

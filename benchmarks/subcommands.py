@@ -21,13 +21,6 @@ def run_script(name: str, arguments: Sequence[str]) -> int:
     """Run a script and return its exit status.
 
     The script is in a session of its own, so that Ctrl-C reaches it once, through this process.
-
-    Args:
-        name: Name of the script in `scripts/`.
-        arguments: Its arguments.
-
-    Raises:
-        Interrupted: A signal that ends this process was received and passed on; the script ended.
     """
     path = os.pathsep.join(filter(None, [str(SCRIPTS.parent), os.environ.get("PYTHONPATH")]))
     process = subprocess.Popen(

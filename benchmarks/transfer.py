@@ -18,30 +18,19 @@ from dpl.training.metrics import median, relative_errors, signal_to_noise
 
 @dataclass(frozen=True)
 class Transfer:
-    """Errors of one network on the test loads of one family.
+    """Errors of one network on the test loads of one family."""
 
-    Attributes:
-        network: Name of the network.
-        trained_on: Family of its training loads.
-        tested_on: Family of the test loads.
-        count: Number of test loads.
-        rel_L2_median, rel_L2_worst: Relative L2 errors of the predictions [-].
-        SNR_min: Smallest signal-to-noise ratio [dB].
-        converged: Part of the loads that the hybrid solves to the tolerance of the scene [%].
-        hybrid_iterations: Mean number of its linear solves for these loads.
-        newton_iterations: Mean number of linear solves of Newton from rest.
-    """
-
-    network: str
-    trained_on: str
-    tested_on: str
-    count: int
+    network: str  # name of the network
+    trained_on: str  # family of its training loads
+    tested_on: str  # family of the test loads
+    count: int  # number of test loads
+    # rel_L2_median, rel_L2_worst: relative L2 errors of the predictions [-]
     rel_L2_median: float
     rel_L2_worst: float
-    SNR_min: float
-    converged: float
-    hybrid_iterations: float
-    newton_iterations: float
+    SNR_min: float  # smallest signal-to-noise ratio [dB]
+    converged: float  # part of the loads that the hybrid solves to the tolerance of the scene [%]
+    hybrid_iterations: float  # mean number of its linear solves for these loads
+    newton_iterations: float  # mean number of linear solves of Newton from rest
 
 
 def differences(scenes: Mapping[str, Scene]) -> list[str]:
@@ -71,16 +60,7 @@ def measure(
     tests: Mapping[str, Sample],
     newton: Mapping[str, float],
 ) -> Iterator[Transfer]:
-    """Yield the row of a network for each set of test loads, computed on one thread.
-
-    Args:
-        network: Name of the network.
-        trained_on: Name of its family.
-        predict: Function from a load to displacements (B, N, D) [-].
-        scene: Scene of the training.
-        tests: Test loads with their solutions, by family.
-        newton: `newton_iterations` of these loads, by family.
-    """
+    """Yield the row of a network for each set of test loads, computed on one thread."""
     hybrid = default_hybrid(predict, scene)
     for family, test in tests.items():
         with one_thread(), torch.inference_mode():
@@ -100,12 +80,7 @@ def measure(
 
 
 def draw(rows: Sequence[Transfer], path: Path) -> None:
-    """Draw median errors as a matrix, trained on against tested on, for each network.
-
-    Args:
-        rows: Rows of `measure` for all networks and families.
-        path: Path of the picture.
-    """
+    """Draw median errors as a matrix, trained on against tested on, for each network."""
     from matplotlib.colors import LogNorm
 
     networks, trained, tested = (
@@ -115,19 +90,22 @@ def draw(rows: Sequence[Transfer], path: Path) -> None:
     known = {(row.network, row.trained_on, row.tested_on): row.rel_L2_median for row in rows}
     finite = [error for error in known.values() if 0 < error < math.inf]
     norm = LogNorm(min(finite), max(finite))
-    size = (len(networks) * (0.62 * len(tested) + 0.3) + 1.6, 0.36 * len(trained) + 1.2)
-    with picture(path, *size) as figure:
-        axes = figure.subplots(1, len(networks), sharey=True, squeeze=False)[0]
-        for ax, network in zip(axes, networks, strict=True):
+    columns = min(len(networks), max(1, 10 // len(tested)))
+    lines = math.ceil(len(networks) / columns)
+    with picture(path, lines * (0.27 * len(trained) + 0.4) + 1.0) as figure:
+        axes = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+        for ax, network in zip(axes.flat, networks, strict=False):
             errors = [[known.get((network, a, b), math.nan) for b in tested] for a in trained]
             ax.imshow(errors, norm=norm, cmap="RdYlGn_r", alpha=0.75, aspect="auto")
             for i, row in enumerate(errors):
                 for j, error in enumerate(row):
                     label = "" if math.isnan(error) else share(error)
-                    ax.text(j, i, label, ha="center", va="center", fontsize=6.5)
+                    ax.text(j, i, label, ha="center", va="center", fontsize=7.5)
             ax.set_title(network)
             ax.set_xticks(range(len(tested)), tested, rotation=45, ha="right")
             ax.set_yticks(range(len(trained)), trained)
             ax.tick_params(length=0)
-            ax.set_xlabel("tested on")
-        axes[0].set_ylabel("trained on")
+        for ax in axes.flat[len(networks) :]:
+            ax.remove()
+        figure.supxlabel("tested on", fontsize=8.5)
+        figure.supylabel("trained on", fontsize=8.5)

@@ -3,4 +3,3 @@
 from pathlib import Path
 
 CONF = Path(__file__).parents[1] / "conf"
-RESULTS = CONF.parent / "results"  # tables in the repository

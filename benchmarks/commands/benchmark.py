@@ -1,13 +1,9 @@
 """Measure run times of the mechanics and of public codes: python scripts/benchmark.py.
 
 Long cases on demand: cases=[large] (run alone, it reports its memory), cases=[robustness],
-cases=[generation], cases=[sizes], cases=[modes] (time of the eigenmodes), cases=[laws] (bodies of
-several laws and with fibres); errors of other meshes: cases=[discretisation]; displacements of the
-test loads: cases=[deflections] count=100;
-latency and throughput of a trained run: cases=[latency] run=runs/mine; loads on small areas:
-cases=[local] run=runs/mine count=250; times to tolerances of all runs below a folder, beside those
-of Newton's method: cases=[newton] run=runs; frames of the page of a run: cases=[frames]
-run=runs/mine.
+cases=[generation], cases=[sizes]; errors of other meshes: cases=[discretisation]; displacements of
+the test loads: cases=[deflections] count=100; latency of a trained run:
+cases=[latency] run=runs/mine; loads on small areas: cases=[local] run=runs/mine count=250.
 """
 
 from collections.abc import Sequence

@@ -27,9 +27,8 @@ KEYS = ((Sequence[str], "bodies"), (str, "name"), *COUNTS)
 @command("error_estimates", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Compare the estimates on all bodies, print one table and write rows and a figure."""
-    from benchmarks import error_estimate_figure, error_estimates
+    from benchmarks import error_estimates
     from benchmarks.study import record
-    from dpl.evaluation.tables import write
 
     unknown = set(cfg.bodies) - set(error_estimates.BODIES)
     if unknown or not cfg.bodies:
@@ -38,10 +37,9 @@ def main(cfg: DictConfig) -> None:
     folder = Path(cfg.folder)
     found = list(_of_runs(cfg) if cfg.run else _of_bodies(cfg, folder))
     rows = error_estimates.summarised(found)
-    write(found, folder / f"{cfg.name}_loads.csv")
-    title = "estimated over true error of all answers, 1 thread"
-    record(rows, folder / cfg.name, title, lambda _, path: error_estimate_figure.draw(found, path))
-    error_estimate_figure.conclude(found)
+    record(found, folder / f"{cfg.name}_loads", None, error_estimates.draw)
+    record(rows, folder / cfg.name, "estimated over true error of all answers, 1 thread")
+    error_estimates.conclude(found)
 
 
 def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator["Estimate"]:
@@ -49,14 +47,15 @@ def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator["Estimate"]:
     from benchmarks import error_estimates
     from benchmarks.samples import first
 
-    sizes = error_estimates.Sizes(cfg.train, cfg.val, cfg.test, cfg.epochs)
     for body in cfg.bodies:
         start = time.perf_counter()
         scene = error_estimates.BODIES[body]()
         print(*scene.describe()[0], flush=True)
-        data = error_estimates.solved_data(scene, sizes, folder / "data" / body)
-        simulators = error_estimates.trained(scene, data, sizes.epochs)
-        test = first(data.samples("test"), sizes.test)
+        data = error_estimates.solved_data(
+            scene, folder / "data" / body, cfg.train, cfg.val, cfg.test
+        )
+        simulators = error_estimates.trained(scene, data, cfg.epochs)
+        test = first(data.samples("test"), cfg.test)
         more = error_estimates.softened(scene, cfg.softened)
         yield from error_estimates.estimates(body, scene, test, simulators, more)
         print(f"{body}: {time.perf_counter() - start:.0f} s", flush=True)

@@ -21,7 +21,6 @@ def main(cfg: DictConfig) -> None:
     from benchmarks import grasps
     from benchmarks.study import record
     from dpl import config
-    from dpl.evaluation.tables import write
     from dpl.inference import Gripper
     from dpl.models.unrolled.correction import MAX_STEPS
     from dpl.system.threads import one_thread
@@ -40,7 +39,7 @@ def main(cfg: DictConfig) -> None:
         rows, unknown = grasps.measure(gripper, every, say)
         amplitudes = grasps.against_amplitude(gripper, every[: cfg.amplitudes])
     title = f"{cfg.count - unknown} random grasps, 1 thread"
-    record(rows, stem, title, lambda _, path: grasps.draw(amplitudes, path))
-    write(amplitudes, stem.with_name(f"{cfg.name}_amplitude.csv"))
+    record(rows, stem, title)
+    record(amplitudes, stem.with_name(f"{cfg.name}_amplitude"), None, grasps.draw)
     print(f"without a solution by Newton's method from rest, left out: {unknown}")
     print(f"slope of the error of the network in the amplitude: {grasps.slope(amplitudes):.2f}")

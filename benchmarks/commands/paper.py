@@ -2,7 +2,7 @@
 
 Prints the plan and trains the runs that are missing, one after the other. Finished runs are
 skipped, interrupted ones resumed, data sets shared. The same command continues after Ctrl-C or a
-failure. RUNS/paper.jsonl and RUNS/paper_times.csv have the wall time of each run.
+failure.
 """
 
 import sys
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig, OmegaConf
 
-from benchmarks.commands import CONF, RESULTS
+from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands.cli import command
 
@@ -32,7 +32,7 @@ WIDTH = 100  # of printed lines
 
 @command("paper", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
-    """Train the runs that are missing; write times, tables and figures."""
+    """Train the runs that are missing; write tables and figures."""
     from benchmarks import paper_runs
     from dpl.system.threads import available_cores
 
@@ -51,9 +51,6 @@ def main(cfg: DictConfig) -> None:
             list(cfg.options),
         )
     states = _plan(runs, root, available_cores())
-    if full:
-        pairs = zip(runs, states, strict=True)
-        _print_estimate([run for run, state in pairs if state != paper_runs.State.FINISHED])
     if cfg.only_plan:
         return
     failed = _train(runs, states, root)
@@ -65,20 +62,13 @@ def main(cfg: DictConfig) -> None:
 
 
 def _plan(runs: "Sequence[Run]", root: Path, cores: int) -> "list[State]":
-    """Print the plan with the states of the runs, and return the states.
-
-    Raises:
-        ConfigError: A run was trained with other options.
-    """
+    """Print the plan with the states of the runs, and return the states."""
     from benchmarks import paper_runs
     from benchmarks.paper_runs import State
 
-    sessions = paper_runs.read_journal(root)
-    states = [paper_runs.state(run, root, sessions) for run in runs]
-    minutes = {row.run: row.minutes for row in paper_runs.times(runs, root, sessions)}
+    states = [paper_runs.state(run, root) for run in runs]
     for run, state in zip(runs, states, strict=True):
-        taken = f", {minutes[run.path]:.1f} min" if run.path in minutes else ""
-        line = f"{state + taken:24} {root / run.path}: {' '.join(run.options)}"
+        line = f"{state:14} {root / run.path}: {' '.join(run.options)}"
         print(line if len(line) <= WIDTH else f"{line[: WIDTH - 4]} ...")
     counts = [f"{states.count(one)} {one}" for one in State if one in states]
     print(f"plan: {len(runs)} runs on {cores} cores, {', '.join(counts)}", flush=True)
@@ -90,48 +80,26 @@ def _plan(runs: "Sequence[Run]", root: Path, cores: int) -> "list[State]":
     return states
 
 
-def _print_estimate(missing: "Sequence[Run]") -> None:
-    """Print the expected time of runs, from the published tables."""
-    from benchmarks.run_estimates import data_minutes, expected_minutes
-
-    if not missing:
-        return
-    known, data = expected_minutes(missing, RESULTS), data_minutes(missing, RESULTS)
-    line = f"published tables: {sum(known.values()) / 60:.1f} h of training for these, "
-    line += f"{data / 60:.1f} h of data sets"
-    unknown = len(missing) - len(known)
-    print(line + (f"; no time of {unknown} runs" if unknown else ""), flush=True)
-
-
 def _train(runs: "Sequence[Run]", states: "Sequence[State]", root: Path) -> list[str]:
-    """Finish the runs, record each session, and return the paths of those that failed."""
+    """Finish the runs and return the paths of those that failed."""
     from benchmarks import paper_runs, subcommands
-    from benchmarks.paper_runs import Session, State
-    from dpl.evaluation.tables import write
-    from dpl.system.threads import available_cores
 
     failed = []
-    missing = [pair for pair in zip(runs, states, strict=True) if pair[1] != State.FINISHED]
+    pairs = zip(runs, states, strict=True)
+    missing = [pair for pair in pairs if pair[1] != paper_runs.State.FINISHED]
     begin = time.perf_counter()
     for number, (run, state) in enumerate(missing, 1):
         script, arguments = paper_runs.arguments(run, root, state)
         print(f"\n[{number}/{len(missing)}] {script} {' '.join(arguments)}", flush=True)
-        start, end = time.perf_counter(), "interrupted"
         try:
             status = subcommands.run_script(script, arguments)
-            end = "failed" if status else "finished"
         finally:
-            taken = round(time.perf_counter() - start, 3)
-            paper_runs.append(Session(run.path, run.options, end, taken, available_cores()), root)
-            rows = paper_runs.times(runs, root, paper_runs.read_journal(root))
-            write(rows, root / "paper_times.csv")
+            paper_runs.keep_options(run, root)
         if status:
             failed.append(run.path)
         minutes = (time.perf_counter() - begin) / 60
-        left = len(missing) - number
-        print(
-            f"{run.path}: {end} in {taken / 60:.1f} min; {left} runs left, {minutes:.1f} min so far"
-        )
+        left = f"{len(missing) - number} runs left, {minutes:.1f} min so far"
+        print(f"{run.path}: {left}", flush=True)
     return failed
 
 

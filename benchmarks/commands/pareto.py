@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from benchmarks.methods import Method
-    from benchmarks.pareto import Discretisation, Point
+    from benchmarks.pareto import Point
 
 METHODS = (dict | None, "galerkin corrected")  # keys of `trained_methods`
-KEYS = (METHODS, (str | None, "discretisation"))
+KEYS = (METHODS,)
 
 
 @command("pareto", conf=CONF, keys=KEYS)
@@ -30,8 +30,7 @@ def main(cfg: DictConfig) -> None:
     from benchmarks.study import record
     from dpl.system.threads import available_cores
 
-    others = _discretisations(cfg)
-    scene, solvers, batch = _solvers(cfg)
+    solvers, batch = _solvers(cfg)
     rows: list[Point] = []
     for threads in cfg.threads:
         count = threads or available_cores()
@@ -40,32 +39,12 @@ def main(cfg: DictConfig) -> None:
             tick = partial(progress.advance, bar)
             rows += pareto.points(solvers, batch, threads=count, tick=tick)
     title = Path(cfg.run).name
-    degree, dofs = scene.problem.degree, scene.problem.free.numel()
-    floor = next((m.error for m in others if (m.degree, m.dofs) == (degree, dofs)), None)
-    first = [row for row in rows if row.threads == rows[0].threads]
-    record(
-        rows, Path(cfg.folder) / f"pareto_{title}", title,
-        lambda _, path: pareto.draw(first, others, floor, path), threads=rows[0].threads,
-    )  # fmt: skip
+    stem = Path(cfg.folder) / f"pareto_{title}"
+    record(rows, stem, title, pareto.draw, threads=rows[0].threads)
 
 
-def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
-    """Return the errors of other meshes to draw; none without a file."""
-    from benchmarks.pareto import Discretisation
-    from benchmarks.tables import read
-
-    if cfg.discretisation is None:
-        return []
-    with config.error_in("discretisation", OSError, ValueError):
-        return read(Discretisation, Path(cfg.discretisation))
-
-
-def _solvers(cfg: DictConfig) -> tuple["dpl.Scene", dict[str, "fem.Solver"], "dpl.Sample"]:
-    """Return the scene of the runs, all solvers including their networks, and the test loads."""
-    import torch
-
-    from benchmarks import pareto
-
+def _solvers(cfg: DictConfig) -> tuple[dict[str, "fem.Solver"], "dpl.Sample"]:
+    """Return all solvers including the networks of the runs, and the test loads."""
     runs = config.load_runs(cfg.run, trust=cfg.trust)
     first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
@@ -78,10 +57,7 @@ def _solvers(cfg: DictConfig) -> tuple["dpl.Scene", dict[str, "fem.Solver"], "dp
         solvers[title] = dpl.Direct(method.predict, scene.problem)
     for name, (_, surrogate) in runs.items():
         solvers[f"{name}, hybrid"] = inference.default_hybrid(surrogate.predict, scene)
-        if torch.cuda.is_available():
-            copy = config.load_run(Path(cfg.run) / name, trust=cfg.trust, scene=scene)[1]
-            solvers[f"{name}, GPU"] = dpl.Direct(pareto.on_gpu(copy), scene.problem)
-    return scene, solvers, data.samples("test")
+    return solvers, data.samples("test")
 
 
 def trained_methods(
@@ -93,9 +69,6 @@ def trained_methods(
 
     The variant is "corrected" or empty. Reduced models are made from the training samples, or from
     the validation samples of a run that has none on disk.
-
-    Raises:
-        ConfigError: `galerkin` or `corrected` cannot be made for this scene and these samples.
     """
     from benchmarks import methods
 

@@ -27,8 +27,7 @@ def main(cfg: DictConfig) -> None:
     """Train, simulate and record the resources of both."""
     # Worker processes import this file and need none of these imports.
     from benchmarks import soak
-    from benchmarks.tables import write_machine
-    from dpl.evaluation import tables as table
+    from benchmarks.study import record
     from dpl.inference import Simulator
 
     if not cfg.workloads:
@@ -40,9 +39,7 @@ def main(cfg: DictConfig) -> None:
     def report(work: list) -> None:
         rows.extend(work)
         wrong.extend(f"{work[-1].workload}: {line}" for line in soak.regressions(work))
-        table.write(rows, folder / "soak.csv")
-        write_machine(folder / "machine.json")
-        soak.draw(rows, folder / "soak.png")
+        record(rows, folder / "soak", None, soak.draw)
         print(soak.summary(work))
 
     if "training" in cfg.workloads:

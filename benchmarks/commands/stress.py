@@ -1,4 +1,4 @@
-"""Run the stress cases: python scripts/stress.py [run=runs/...].
+"""Run the stress cases: python scripts/stress.py.
 
 Each case prints its task, its expected and its observed outcome. The exit status is 1 if an
 outcome is silently wrong.
@@ -22,18 +22,14 @@ COLOURS = {"as expected": "green", "reported": "yellow", "silently wrong": "bold
 
 @command("stress", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
-    """Run the cases; rows are written after each case, the figure at the end."""
+    """Run the cases; rows are written after each case."""
     from benchmarks import stress
-    from benchmarks.stress.drawing import draw
-    from benchmarks.tables import write_machine
+    from benchmarks.study import write_machine
 
     try:
         cases = stress.select_cases(cfg.cases)
     except ValueError as error:
         raise config.ConfigError(f"cases: {error}") from error
-    if cfg.run is not None:
-        _, surrogate = config.load_run(cfg.run)
-        cases += stress.trained_run.cases(surrogate)
     folder, console = Path(cfg.folder), Console(highlight=False)
     lines: list[stress.CaseResult] = []
     comparisons: list[stress.Comparison] = []
@@ -54,9 +50,7 @@ def main(cfg: DictConfig) -> None:
             f"    expected: {line.expected}\n    observed: {line.observed}",
             soft_wrap=True,
         )
-    write_machine(folder / "machine.json")
-    if levels:
-        draw(levels, folder / "load_sweeps.png")
+    write_machine(folder / "machine.json", threads=1)
     print(_summary(lines))
     if any(line.verdict == stress.Verdict.WRONG for line in lines):
         sys.exit(1)

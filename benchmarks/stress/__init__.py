@@ -8,7 +8,7 @@ independent finite-element program in NumPy.
 
 from collections.abc import Sequence
 
-from benchmarks.stress import bodies, invalid_input, loads, networks, stability, trained_run
+from benchmarks.stress import bodies, invalid_input, loads, networks, stability
 from benchmarks.stress.case import (
     Case,
     CaseResult,
@@ -20,30 +20,9 @@ from benchmarks.stress.case import (
     run_case,
 )
 
-__all__ = [
-    "Case",
-    "Line",
-    "LoadLevel",
-    "Number",
-    "Outcome",
-    "Verdict",
-    "matrix",
-    "names",
-    "numbers",
-    "perform",
-    "trained_run",
-]
-
 
 def select_cases(wanted: Sequence[str] | None = None) -> list[Case]:
-    """Return the cases of the mechanics and of predictors that stand for networks.
-
-    Args:
-        wanted: Names of cases; all if left out.
-
-    Raises:
-        ValueError: A name is unknown.
-    """
+    """Return the cases of the mechanics and of predictors that stand for networks."""
     themes = loads, bodies, invalid_input, stability, networks
     found = sorted((case for theme in themes for case in theme.cases()), key=_order)
     known = names(found)

@@ -13,24 +13,10 @@ from benchmarks.stress.fixtures import as_load
 from benchmarks.stress.loads import describe, newton_variants
 from benchmarks.verification.refinement import LOCKING, POISSON, compliance
 from benchmarks.verification.report import Row
-from dpl import Scene
-from dpl.fem import (
-    LinearSolver,
-    Material,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Traction,
-    box,
-    installed_backends,
-    solve,
-)
+from dpl import Scene, fem
 
-SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
-DIRECT = [name for name in installed_backends() if name != "cg"]
+SVK, NH = fem.SaintVenantKirchhoff(0.3), fem.NeoHookeanLn(0.3)
+DIRECT = [name for name in fem.installed_backends() if name != "cg"]
 UNIT_SYSTEMS = [
     (4500.0, 25.0),
     (1.0, 1e-3),
@@ -38,7 +24,7 @@ UNIT_SYSTEMS = [
     (1e12, 1e-3),
     (1e12, 1e3),
 ]  # E [Pa], side [m]
-REFERENCE_CORNER: list[tuple[str, Material, tuple[str, str, str]]] = [  # u/L of the corner
+REFERENCE_CORNER: list[tuple[str, fem.Material, tuple[str, str, str]]] = [  # u/L of the corner
     ("SVK", SVK, ("8.023468838e-3", "-2.392426382e-4", "-.2479226415")),
     ("NH-ln", NH, ("1.024683172e-2", "-2.397967447e-4", "-.2477360716")),
 ]
@@ -58,14 +44,14 @@ SLIVER_DEFLECTIONS = {
 ASPECTS = (1.0, 10.0, 100.0, 1000.0)
 
 
-def unit_systems(law: Material, printed: tuple[str, ...], auditor: Auditor) -> Outcome:
+def unit_systems(law: fem.Material, printed: tuple[str, ...], auditor: Auditor) -> Outcome:
     """Bend the same beam in several systems of units, [N] to [m]."""
     rows, failures, counts = [], [], []
     for young, side in UNIT_SYSTEMS:
-        mesh = box([4 * side, side, side], [9, 3, 3])
-        problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
-        newton = Newton(problem, mixed_integration=False)
-        scene = Scene(problem, ModalLoads(newton.linear_solver, n_modes=1, young=young), newton)
+        mesh = fem.box([4 * side, side, side], [9, 3, 3])
+        problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"))
+        newton = fem.Newton(problem, mixed_integration=False)
+        scene = Scene(problem, fem.ModalLoads(newton.linear_solver, n_modes=1, young=young), newton)
         newtons = young * scene.force_unit * fixtures.end_traction(problem, 20.0)
         given = scene.load_of(newtons[None], torch.tensor([young], dtype=torch.float64))
         state = auditor.solve(newton, problem, given)
@@ -121,7 +107,7 @@ def plate_bending(cells: tuple[int, int, int], auditor: Auditor) -> Outcome:
 
 def _plate(cells: tuple[int, int, int], slenderness: int) -> float:
     problem, force, known = fixtures.plate(*cells, slenderness)
-    answer = solve(LinearSolver(problem), as_load(force))
+    answer = fem.solve(fem.LinearSolver(problem), as_load(force))
     below = fixtures.nearest_node(problem, [0.5, 0.5, 0.0])
     return -answer.displacement[0, below, 2].item() / known
 
@@ -145,9 +131,9 @@ def long_cells(auditor: Auditor) -> Outcome:
     """Pull rods of cells with growing aspect ratio to a stretch of 1.5."""
     rows, failures = [], []
     for aspect in ASPECTS:
-        mesh = box([1.0, 1 / aspect, 1 / aspect], [3, 3, 3])
-        problem = Problem.build(mesh, NH, fixed=mesh.p.T == 0, length=1.0)
-        force = Traction(Plane(0, "max"), [0.37828018, 0.0, 0.0]).on(problem)
+        mesh = fem.box([1.0, 1 / aspect, 1 / aspect], [3, 3, 3])
+        problem = fem.Problem.build(mesh, NH, fixed=mesh.p.T == 0, length=1.0)
+        force = fem.Traction(fem.Plane(0, "max"), [0.37828018, 0.0, 0.0]).on(problem)
         for name, newton in newton_variants(problem):
             state = auditor.solve(newton, problem, as_load(force))
             if not state.stable.all():
@@ -166,7 +152,7 @@ def sliver(part: float, auditor: Auditor) -> Outcome:
     mesh = fixtures.sliver_mesh(part)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        problem = Problem.build(mesh, SVK, fixed=Plane(0, "min"))
+        problem = fem.Problem.build(mesh, SVK, fixed=fem.Plane(0, "min"))
     said = any("aspect ratio" in str(w.message) for w in caught)
     rows.append(Row("warnings of aspect ratio", "1", float(said), 0))
     end = int(problem.points.sum(dim=1).argmax())

@@ -22,83 +22,53 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class LoadLevel:
-    """One load of a load sweep.
+    """One load of a load sweep."""
 
-    Attributes:
-        series: Name of the sweep.
-        amplitude: Load over the largest load of the training range [-].
-        residual: Final relative residual ||R_free|| / ||f|| [-].
-        volume_ratio: Smallest min det F of all states [-].
-        iterations: Linear solves.
-        status: Final status.
-        error: ||u - u*|| / ||u*|| against Newton's solution u* [-]; NaN if it was not computed.
-    """
-
-    series: str
-    amplitude: float
-    residual: float
-    volume_ratio: float
-    iterations: int
-    status: str
+    series: str  # name of the sweep
+    amplitude: float  # load over the largest load of the training range [-]
+    residual: float  # final relative residual ||R_free|| / ||f|| [-]
+    volume_ratio: float  # smallest min det F of all states [-]
+    iterations: int  # linear solves
+    status: str  # final status
+    # ||u - u*|| / ||u*|| against Newton's solution u* [-]; NaN if it was not computed
     error: float = math.nan
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a case.
+    """Result of a case."""
 
-    Attributes:
-        observed: Description of what happened.
-        verdict: Its classification.
-        rows: Measured numbers with their references.
-        levels: Loads of a load sweep, to be drawn.
-    """
-
-    observed: str
-    verdict: Verdict
-    rows: Sequence[Row] = ()
-    levels: Sequence[LoadLevel] = ()
+    observed: str  # description of what happened
+    verdict: Verdict  # its classification
+    rows: Sequence[Row] = ()  # measured numbers with their references
+    levels: Sequence[LoadLevel] = ()  # loads of a load sweep, to be drawn
 
 
 @dataclass(frozen=True)
 class Case:
-    """A difficult or unsolvable task for the package.
+    """A difficult or unsolvable task for the package."""
 
-    Attributes:
-        name: Identifier, T1 to T23 or "sweep"; the cases of one topic share it.
-        description: The task.
-        expected: The expected outcome.
-        run: Performs the task; the auditor checks all solves.
-    """
-
-    name: str
-    description: str
-    expected: str
-    run: Callable[[Auditor], Outcome]
+    name: str  # identifier, T1 to T23 or "sweep"; the cases of one topic share it
+    description: str  # the task
+    expected: str  # the expected outcome
+    run: Callable[[Auditor], Outcome]  # performs the task; the auditor checks all solves
 
 
 @dataclass(frozen=True)
 class CaseResult:
-    """A case that was run, one row of cases.csv.
+    """A case that was run, one row of cases.csv."""
 
-    Attributes:
-        case, description, expected: See `Case`.
-        observed, verdict: See `Outcome`.
-        solves: Number of solves.
-        states_checked: Number of states of these solves; the auditor checks all of them.
-        min_detF: Smallest min det F of the accepted states [-]; NaN without any.
-        seconds: Wall time [s].
-    """
-
+    # case, description, expected: See `Case`
     case: str
     description: str
     expected: str
+    # observed, verdict: See `Outcome`
     observed: str
     verdict: str
-    solves: int
-    states_checked: int
-    min_detF: float
-    seconds: float
+    solves: int  # number of solves
+    states_checked: int  # number of states of these solves; the auditor checks all of them
+    min_detF: float  # smallest min det F of the accepted states [-]; NaN without any
+    seconds: float  # wall time [s]
 
 
 @dataclass(frozen=True)

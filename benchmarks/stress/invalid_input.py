@@ -13,48 +13,37 @@ from benchmarks.stress.auditor import Auditor
 from benchmarks.stress.case import Case, Outcome, classify, combine, expect_error
 from benchmarks.stress.fixtures import as_load
 from benchmarks.verification.report import Row
-from dpl.fem import (
-    Box,
-    DirichletBC,
-    LinearSolver,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    RobinBC,
-    Status,
-    Tag,
-    Traction,
-    box,
-    eigenmodes,
-    installed_backends,
-    read_mesh,
-)
+from dpl import fem
 from dpl.fem.mesh import check_mesh
 
-NH = NeoHookeanLn(0.3)
+NH = fem.NeoHookeanLn(0.3)
 DISCONNECTED = ["two pieces", "crack"]  # T14; the other meshes are T15
-EMPTY_REGIONS = {"plane": Plane(0, 0.3), "box": Box([2, 2, 2], [3, 3, 3]), "tag": Tag("end")}
+EMPTY_REGIONS = {
+    "plane": fem.Plane(0, 0.3),
+    "box": fem.Box([2, 2, 2], [3, 3, 3]),
+    "tag": fem.Tag("end"),
+}
 REGION_USES: dict[
     str, Callable[[Any, Any], Any]
 ] = {  # uses of a region, functions of mesh and region
-    "fixed": lambda mesh, region: Problem.build(mesh, NH, fixed=region),
-    "moved": lambda mesh, region: Problem.build(mesh, NH, supports=[DirichletBC(region)]),
-    "spring": lambda mesh, region: Problem.build(mesh, NH, supports=[RobinBC(region, 1.0)]),
-    "loaded": lambda mesh, region: Traction(region, [0, 0, 1.0]).on(Problem.build(mesh, NH)),
+    "fixed": lambda mesh, region: fem.Problem.build(mesh, NH, fixed=region),
+    "moved": lambda mesh, region: fem.Problem.build(mesh, NH, supports=[fem.DirichletBC(region)]),
+    "spring": lambda mesh, region: fem.Problem.build(mesh, NH, supports=[fem.RobinBC(region, 1.0)]),
+    "loaded": lambda mesh, region: fem.Traction(region, [0, 0, 1.0]).on(
+        fem.Problem.build(mesh, NH)
+    ),
 }
 
 
-def of_modulus(young: float) -> ModalLoads:
+def of_modulus(young: float) -> fem.ModalLoads:
     """Return modal loads on the beam with a Young's modulus [Pa]."""
     problem = fixtures.coarse_beam("hexahedron", 1, NH)
-    return ModalLoads(LinearSolver(problem), n_modes=1, young=young)
+    return fem.ModalLoads(fem.LinearSolver(problem), n_modes=1, young=young)
 
 
 OUT_OF_RANGE: dict[str, tuple[Callable[[], Any], str]] = {  # T9: call, words
     **{
-        f"nu = {nu}": (partial(NeoHookeanLn, nu), "poisson")
+        f"nu = {nu}": (partial(fem.NeoHookeanLn, nu), "poisson")
         for nu in (0.5, 0.7, -1.0, float("nan"), float("inf"))
     },
     **{
@@ -88,17 +77,17 @@ def _counted(found: list[Outcome]) -> Outcome:
 def underconstrained(support: str, auditor: Auditor) -> Outcome:
     """Solve and compute modes of a body with rigid-body modes, with every backend."""
     problem = fixtures.underconstrained_bar(support)
-    linear = LinearSolver(problem)
+    linear = fem.LinearSolver(problem)
     outcome = expect_error(
-        support, lambda: eigenmodes(linear, 3), fixtures.UNDERCONSTRAINED[support][1]
+        support, lambda: fem.eigenmodes(linear, 3), fixtures.UNDERCONSTRAINED[support][1]
     )
-    force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
     rows = [Row("factors before the error", "0", float("factor" in linear.__dict__))]
-    for name in installed_backends():
-        state = auditor.solve(Newton(problem, linear=name), problem, as_load(force))
+    for name in fem.installed_backends():
+        state = auditor.solve(fem.Newton(problem, linear=name), problem, as_load(force))
         rows.append(Row(f"{name}: converged", "< 0.5", float(state.converged)))
         rows.append(Row(f"{name}: |u|/L", "0", float(state.displacement.abs().max())))
-    return combine([outcome, classify(f"{Status(int(state.status))}, at rest", rows)])
+    return combine([outcome, classify(f"{fem.Status(int(state.status))}, at rest", rows)])
 
 
 def read_broken_meshes(names: list[str], auditor: Auditor) -> Outcome:
@@ -108,7 +97,7 @@ def read_broken_meshes(names: list[str], auditor: Auditor) -> Outcome:
         for name in names:
             said, points, cells = broken_meshes.BROKEN_MESHES[name]
             path = broken_meshes.write(Path(folder) / "bad.vtu", np.asarray(points, float), **cells)
-            found.append(expect_error(name, partial(read_mesh, path), said))
+            found.append(expect_error(name, partial(fem.read_mesh, path), said))
     return _counted([_without(outcome, folder) for outcome in found])
 
 
@@ -122,9 +111,9 @@ def read_damaged_files(auditor: Auditor) -> Outcome:
         for name, content in (("half", whole[: len(whole) // 2]), ("empty", b""), ("text", b"no")):
             path = Path(folder) / f"{name}.vtu"
             path.write_bytes(content)
-            found.append(expect_error(name, partial(read_mesh, path), f"{name}.vtu"))
+            found.append(expect_error(name, partial(fem.read_mesh, path), f"{name}.vtu"))
         found.append(
-            expect_error("none", partial(read_mesh, Path(folder) / "none.vtu"), "none.vtu")
+            expect_error("none", partial(fem.read_mesh, Path(folder) / "none.vtu"), "none.vtu")
         )
     return _counted([_without(outcome, folder) for outcome in found])
 
@@ -136,7 +125,7 @@ def _without(outcome: Outcome, folder: str) -> Outcome:
 
 def empty_regions(auditor: Auditor) -> Outcome:
     """Use regions without nodes as supports and loads."""
-    mesh = box([1.0, 1.0, 1.0], [3, 3, 3])
+    mesh = fem.box([1.0, 1.0, 1.0], [3, 3, 3])
     found = []
     for use, call in REGION_USES.items():
         for where, region in EMPTY_REGIONS.items():

@@ -13,28 +13,13 @@ from benchmarks.stress.fixtures import ELEMENTS, MAX_TRACTION, as_load, coarse_b
 from benchmarks.verification.bodies import NAMES, mean, paper_beam, slender
 from benchmarks.verification.report import Row
 from benchmarks.verification.uniaxial import LAWS
-from dpl import Scene
+from dpl import Scene, fem
 from dpl.data.solving.solve import LoadKey, solve_load
-from dpl.fem import (
-    LinearSolver,
-    Material,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Solution,
-    Status,
-    Traction,
-    evaluate_solution,
-    solve,
-)
 
-SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
+SVK, NH = fem.SaintVenantKirchhoff(0.3), fem.NeoHookeanLn(0.3)
 CELLS = (16, 4, 4)
 # case, law, q [Pa], min J, smallest nodal u_z / L
-LARGE: list[tuple[str, Material, float, str, str]] = [
+LARGE: list[tuple[str, fem.Material, float, str, str]] = [
     ("T1", SVK, 80.0, ".720", ""),
     ("T3", NH, 80.0, ".804", "-.7239"),
     ("T4", NH, 160.0, ".723", "-.9179"),
@@ -55,19 +40,19 @@ AMPLITUDES = (
 )  # over the largest load of the training range
 
 
-def newton_variants(problem: Problem) -> Iterator[tuple[str, Newton]]:
+def newton_variants(problem: fem.Problem) -> Iterator[tuple[str, fem.Newton]]:
     """Yield Newton without and, where the law supports them, with mixed integration points."""
     for mixed in (False, True) if problem.material.has_response else (False,):
-        yield ("mixed" if mixed else "plain"), Newton(problem, mixed_integration=mixed)
+        yield ("mixed" if mixed else "plain"), fem.Newton(problem, mixed_integration=mixed)
 
 
-def describe(state: Solution) -> str:
+def describe(state: fem.Solution) -> str:
     """Return status, iterations, residual and min det F of a solution as text."""
-    said = f"{Status(int(state.status))} in {int(state.iterations)} iterations"
+    said = f"{fem.Status(int(state.status))} in {int(state.iterations)} iterations"
     return f"{said}, |R|/|f| {float(state.residual):.0e}, min J {float(state.volume_ratio):.3f}"
 
 
-def large_load(law: Material, q: float, volume: str, deepest: str, auditor: Auditor) -> Outcome:
+def large_load(law: fem.Material, q: float, volume: str, deepest: str, auditor: Auditor) -> Outcome:
     """Solve a large load that has a solution."""
     problem, rows, failures, messages = paper_beam(law, CELLS), [], [], []
     for name, newton in newton_variants(problem):
@@ -89,9 +74,11 @@ def load_without_equilibrium(q: float, auditor: Auditor) -> Outcome:
     for name, newton in newton_variants(problem):
         state = auditor.solve(newton, problem, as_load(end_traction(problem, q)))
         part = q * float(state.load_factor)
-        messages.append(f"{name}: {Status(int(state.status))}, answered up to q = {part:.1f} Pa")
+        messages.append(
+            f"{name}: {fem.Status(int(state.status))}, answered up to q = {part:.1f} Pa"
+        )
         rows.append(Row(f"{name}: converged", "< 0.5", float(state.converged)))
-        if state.status != Status.NO_VALID_EQUILIBRIUM or not 130 < part < q:
+        if state.status != fem.Status.NO_VALID_EQUILIBRIUM or not 130 < part < q:
             failures.append(f"{name}: not the status, or not the part of the load")
     return classify("; ".join(messages), rows, failures=failures)
 
@@ -99,13 +86,15 @@ def load_without_equilibrium(q: float, auditor: Auditor) -> Outcome:
 def data_of_large_loads(auditor: Auditor) -> Outcome:
     """Generate samples of loads up to 25 times the usual ones and evaluate accepted ones again."""
     problem = paper_beam(SVK, (8, 2, 2))
-    newton = Newton(problem)
-    scene = Scene(problem, ModalLoads(newton.linear_solver, n_modes=3, deflection=25 * 0.4), newton)
+    newton = fem.Newton(problem)
+    scene = Scene(
+        problem, fem.ModalLoads(newton.linear_solver, n_modes=3, deflection=25 * 0.4), newton
+    )
     rows, accepted = list[Row](), 0
     for number in range(8):
         made = solve_load(scene, LoadKey((0, 0), number))
         u = torch.from_numpy(made.displacement)[None]
-        sound = evaluate_solution(problem, u, as_load(torch.from_numpy(made.force)), newton.tol)
+        sound = fem.evaluate_solution(problem, u, as_load(torch.from_numpy(made.force)), newton.tol)
         kept = f"load {number}"
         if made.accepted:
             accepted += 1
@@ -119,8 +108,8 @@ def data_of_large_loads(auditor: Auditor) -> Outcome:
 
 def slender_beam(auditor: Auditor) -> Outcome:
     """Bend a slender beam by the whole load in one step."""
-    problem = slender(NeoHookeanLn(0.0), (20, 1, 1))
-    force = Traction(Plane(0, "max"), [0.0, 0.0, -1 / 12 / 400]).on(problem)
+    problem = slender(fem.NeoHookeanLn(0.0), (20, 1, 1))
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -1 / 12 / 400]).on(problem)
     messages, rows, failures = [], [], []
     for name, newton in newton_variants(problem):
         states = list(auditor.wrap(newton, problem, newton.tol).iterate(as_load(force)))
@@ -142,24 +131,24 @@ def small_loads(name: str, auditor: Auditor) -> Outcome:
     corner, most = int(problem.points.sum(dim=1).argmax()), 0
     for q in (*SMALL, 1e-12):
         load = as_load(end_traction(problem, q))
-        state = auditor.solve(Newton(problem), problem, load)
+        state = auditor.solve(fem.Newton(problem), problem, load)
         most = max(most, int(state.iterations))
         if not state.stable.all():
             failures.append(f"q = {q:g}: {describe(state)}")
             continue
-        linear = solve(LinearSolver(problem), load).displacement[0, corner, 2]
+        linear = fem.solve(fem.LinearSolver(problem), load).displacement[0, corner, 2]
         ratio = float(state.displacement[0, corner, 2] / linear)
         rows.append(Row(f"q = {q:g} Pa: u_z over the linear one", "1", ratio, max(1e-2 * q, 1e-6)))
-    none = auditor.solve(Newton(problem), problem, as_load(0 * end_traction(problem, 1.0)))
+    none = auditor.solve(fem.Newton(problem), problem, as_load(0 * end_traction(problem, 1.0)))
     rows.append(Row("no load: |u|/L", "0", float(none.displacement.abs().max())))
     rows.append(Row("no load: iterations", "0", float(none.iterations)))
     return classify(f"linear within 1e-6, at most {most} iterations", rows, failures=failures)
 
 
-def load_sweep(series: str, build: Callable[[], Problem], auditor: Auditor) -> Outcome:
+def load_sweep(series: str, build: Callable[[], fem.Problem], auditor: Auditor) -> Outcome:
     """Solve loads of growing amplitude."""
     problem = build()
-    unit, newton = end_traction(problem, MAX_TRACTION), Newton(problem)
+    unit, newton = end_traction(problem, MAX_TRACTION), fem.Newton(problem)
     levels, failures, rows = [], [], []
     for amplitude in AMPLITUDES:
         state, min_detF = _solve_level(auditor, newton, amplitude * unit)
@@ -167,7 +156,7 @@ def load_sweep(series: str, build: Callable[[], Problem], auditor: Auditor) -> O
         if amplitude <= 1 and not state.converged.all():
             failures.append(f"{amplitude:g} of the range: {describe(state)}")
         if amplitude <= 1e-3 and state.converged.all():
-            linear = solve(LinearSolver(problem), as_load(amplitude * unit)).displacement
+            linear = fem.solve(fem.LinearSolver(problem), as_load(amplitude * unit)).displacement
             apart = float((state.displacement - linear).norm() / linear.norm())
             rows.append(
                 Row(f"{series}, {amplitude:g}: off linear", f"< {max(amplitude, 1e-6)}", apart)
@@ -177,14 +166,14 @@ def load_sweep(series: str, build: Callable[[], Problem], auditor: Auditor) -> O
 
 
 def level(
-    series: str, amplitude: float, state: Solution, min_detF: float, error: float = math.nan
+    series: str, amplitude: float, state: fem.Solution, min_detF: float, error: float = math.nan
 ) -> LoadLevel:
     """Return a load of a sweep with its solution, see `LoadLevel`."""
-    status, iterations = str(Status(int(state.status))), int(state.iterations)
+    status, iterations = str(fem.Status(int(state.status))), int(state.iterations)
     return LoadLevel(series, amplitude, float(state.residual), min_detF, iterations, status, error)
 
 
-def _solve_level(auditor: Auditor, newton: Newton, force: Tensor) -> tuple[Solution, float]:
+def _solve_level(auditor: Auditor, newton: fem.Newton, force: Tensor) -> tuple[fem.Solution, float]:
     """Return the solution under a force and the smallest min det F of all states."""
     states = list(auditor.wrap(newton, newton.problem, newton.tol).iterate(as_load(force)))
     return states[-1], min(float(state.volume_ratio) for state in states)

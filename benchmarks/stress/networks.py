@@ -14,27 +14,13 @@ from benchmarks.stress.fixtures import MAX_TRACTION, YOUNG, as_load, end_tractio
 from benchmarks.stress.loads import AMPLITUDES, describe, level
 from benchmarks.verification.bodies import paper_beam
 from benchmarks.verification.report import Row
-from dpl import Scene
-from dpl.fem import (
-    AndersonSolver,
-    LinearSolver,
-    Load,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Solver,
-    box,
-    solve,
-)
+from dpl import Scene, fem
 from dpl.inference import Direct, Hybrid, prefer_prediction
 from dpl.inference.hybrid import Predict
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
 
-SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
+SVK, NH = fem.SaintVenantKirchhoff(0.3), fem.NeoHookeanLn(0.3)
 INVALID = ("not a number", "one not a number", "infinite", "inverted")
 # T20: rms noise over L -> residual ratio of the prediction, plain iterations
 NOISE = {1e-2: ("592", "14"), 1e-3: ("53.6", "5"), 1e-4: ("5.47", "3"), 1e-5: (".534", "2")}
@@ -50,17 +36,17 @@ FLOAT32 = 1.5e-4  # T18: residual ratio of an exact answer, rounded to float32, 
 def scene() -> Scene:
     """Return the beam of 8 x 2 x 2 cells of NH-ln with three modes."""
     problem = paper_beam(NH, (8, 2, 2))
-    newton = Newton(problem)
-    return Scene(problem, ModalLoads(newton.linear_solver, n_modes=3, young=YOUNG), newton)
+    newton = fem.Newton(problem)
+    return Scene(problem, fem.ModalLoads(newton.linear_solver, n_modes=3, young=YOUNG), newton)
 
 
 @cache
-def bent_beam() -> tuple[Newton, Load, Tensor]:
+def bent_beam() -> tuple[fem.Newton, fem.Load, Tensor]:
     """Return the beam of 16 x 4 x 4 cells of SVK, q = 20 Pa and the exact answer (1, N, 3)."""
     problem = paper_beam(SVK, (16, 4, 4))
     load = as_load(end_traction(problem, 20.0))
-    newton = Newton(problem, linear="auto")
-    return newton, load, solve(replace(newton, tol=1e-12), load).displacement
+    newton = fem.Newton(problem, linear="auto")
+    return newton, load, fem.solve(replace(newton, tol=1e-12), load).displacement
 
 
 def constant_prediction(displacement: Tensor) -> Predict:
@@ -68,18 +54,18 @@ def constant_prediction(displacement: Tensor) -> Predict:
     return lambda load: displacement
 
 
-def hybrids(newton: Newton) -> dict[str, Callable[[Tensor], Solver]]:
+def hybrids(newton: fem.Newton) -> dict[str, Callable[[Tensor], fem.Solver]]:
     """Return hybrid solvers by name, as functions of the prediction (1, N, D) [-]."""
     return {
         "natural_monotonicity": lambda guess: Hybrid(constant_prediction(guess), newton),
         "paper": lambda guess: Hybrid(constant_prediction(guess), newton, "paper"),
         "steps": lambda guess: Hybrid(
-            constant_prediction(guess), newton, steps=AndersonSolver(newton)
+            constant_prediction(guess), newton, steps=fem.AndersonSolver(newton)
         ),
     }
 
 
-def _invalid_predictions(problem: Problem, truth: Tensor) -> dict[str, Tensor]:
+def _invalid_predictions(problem: fem.Problem, truth: Tensor) -> dict[str, Tensor]:
     """Return invalid predictions (1, N, D) by name."""
     one = truth.clone()
     one[:, -1, 0] = torch.nan
@@ -95,7 +81,7 @@ def invalid_prediction(name: str, auditor: Auditor) -> Outcome:
     """Start the hybrid from an invalid prediction: the solution is Newton's, bit for bit."""
     newton, load, truth = bent_beam()
     problem, guess = newton.problem, _invalid_predictions(newton.problem, truth)[name]
-    classic, rows = solve(newton, load), []
+    classic, rows = fem.solve(newton, load), []
     for way, hybrid in hybrids(newton).items():
         state = auditor.solve(hybrid(guess), problem, load)
         same = torch.equal(state.displacement, classic.displacement)
@@ -209,13 +195,13 @@ def network_precision(dtype: torch.dtype, device: str, auditor: Auditor) -> Outc
     surrogate = Surrogate(FCNN(own, width=64), MSE(), own).to(device, dtype)
     drawn = own.loads.sample((0, 9), range(4))
 
-    def predict(load: Load) -> Tensor:
-        return surrogate.predict(Load(*(column.to(device) for column in load))).cpu()
+    def predict(load: fem.Load) -> Tensor:
+        return surrogate.predict(fem.Load(*(column.to(device) for column in load))).cpu()
 
     with torch.inference_mode():
         said = predict(drawn)
         state = auditor.solve(Hybrid(predict, own.newton), own.problem, drawn)
-    exact = solve(replace(own.newton, tol=1e-12), drawn).displacement
+    exact = fem.solve(replace(own.newton, tol=1e-12), drawn).displacement
     off = float((state.displacement - exact).abs().max())
     rows = [
         Row("the prediction is float64", "1", float(said.dtype == torch.float64), 0),
@@ -230,7 +216,7 @@ def float32_forces(auditor: Auditor) -> Outcome:
     """Solve with forces in float32: no solution may have that precision."""
     newton, load, truth = bent_beam()
     try:
-        state = solve(newton, Load(load.force.float(), load.young, load.parameters))
+        state = fem.solve(newton, fem.Load(load.force.float(), load.young, load.parameters))
     except (RuntimeError, TypeError, ValueError) as error:
         return classify(f"{type(error).__name__}: {error}")
     off = float((state.displacement.double() - truth).abs().max())
@@ -245,8 +231,8 @@ def load_sweep(auditor: Auditor) -> Outcome:
     for way in ("natural_monotonicity", "paper", "steps"):
         for amplitude in AMPLITUDES:
             load = as_load(amplitude * unit)
-            guess = solve(LinearSolver(problem), load).displacement
-            exact = solve(own.solver, load)
+            guess = fem.solve(fem.LinearSolver(problem), load).displacement
+            exact = fem.solve(own.solver, load)
             hybrid = hybrids(own.newton)[way](guess)
             states = list(auditor.wrap(hybrid, problem, own.solver.tol).iterate(load))
             last = states[-1]
@@ -269,10 +255,10 @@ def _summary(levels: list[LoadLevel]) -> str:
 
 def too_large(auditor: Auditor) -> Outcome:
     """Build the paper's network on a mesh of more than 100,000 degrees of freedom."""
-    mesh = box([1.0, 1.0, 1.0], [33, 33, 33])
-    problem = Problem.build(mesh, NH, fixed=Plane(0, "min"))
-    newton = Newton(problem)
-    own = Scene(problem, ModalLoads(newton.linear_solver, n_modes=1, young=YOUNG), newton)
+    mesh = fem.box([1.0, 1.0, 1.0], [33, 33, 33])
+    problem = fem.Problem.build(mesh, NH, fixed=fem.Plane(0, "min"))
+    newton = fem.Newton(problem)
+    own = Scene(problem, fem.ModalLoads(newton.linear_solver, n_modes=1, young=YOUNG), newton)
     size = problem.points.numel()
     text = f"{4 * size**2 + 7 * size:,} parameters"
     build = partial(FCNN, own, all_dofs=True, memory_limit=128.0)

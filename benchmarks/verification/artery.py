@@ -12,22 +12,11 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
+from benchmarks.study import picture
 from benchmarks.verification.bodies import Array, balanced
-from benchmarks.verification.drawing import measured, panel, picture
+from benchmarks.verification.drawing import measured, panel
 from benchmarks.verification.report import Row, Section
-from dpl.fem import (
-    DirichletBC,
-    FibreFunction,
-    FibreReinforced,
-    FollowerPressure,
-    HolzapfelGasserOgdenFibres,
-    Material,
-    NeoHookeanIsoK4,
-    Newton,
-    Plane,
-    Problem,
-    rectangle,
-)
+from dpl import fem
 
 INNER, MIDDLE, OUTER = 1.0, 1.5, 2.0  # radii [mm]
 BULKS = (1e2, 1e4, 1e6)  # bulk over shear modulus of each layer [-]
@@ -37,21 +26,13 @@ CELLS = ((4, 16), (8, 32), (16, 64))  # through the wall and around a quarter
 
 @dataclass(frozen=True)
 class Layer:
-    """Neo-Hookean layer with two families of fibres.
+    """Neo-Hookean layer with two families of fibres."""
 
-    Attributes:
-        mu: Shear modulus of the matrix [kPa].
-        k1: Modulus of the fibres [kPa]; 0: none.
-        k2: Exponent of the fibres [-].
-        kappa: Dispersion of the fibres [-].
-        angle: Angle between fibres and circumference [rad].
-    """
-
-    mu: float
-    k1: float = 0.0
-    k2: float = 1.0
-    kappa: float = 0.0
-    angle: float = 0.0
+    mu: float  # shear modulus of the matrix [kPa]
+    k1: float = 0.0  # modulus of the fibres [kPa]; 0: none
+    k2: float = 1.0  # exponent of the fibres [-]
+    kappa: float = 0.0  # dispersion of the fibres [-]
+    angle: float = 0.0  # angle between fibres and circumference [rad]
 
     def pull(self, hoop: float) -> float:
         """Return dW/d(hoop) [kPa] at the stretches 1/hoop, hoop and 1."""
@@ -63,14 +44,14 @@ class Layer:
             return self.mu * change
         return self.mu * change + 2 * self.k1 * strain * math.exp(self.k2 * strain**2) * slope
 
-    def law(self, bulk: float) -> Material:
+    def law(self, bulk: float) -> fem.Material:
         """Return the law with a bulk modulus over mu."""
         nu = (3 * bulk - 2) / (2 * (3 * bulk + 1))
-        matrix = NeoHookeanIsoK4(nu, young=2 * self.mu * (1 + nu))
+        matrix = fem.NeoHookeanIsoK4(nu, young=2 * self.mu * (1 + nu))
         if not self.k1:
             return matrix
-        fibres = HolzapfelGasserOgdenFibres(self.k1, self.k2, self.kappa, self.angle)
-        return FibreReinforced(matrix, fibres, FibreFunction(_hoop_and_axis))
+        fibres = fem.HolzapfelGasserOgdenFibres(self.k1, self.k2, self.kappa, self.angle)
+        return fem.FibreReinforced(matrix, fibres, fem.FibreFunction(_hoop_and_axis))
 
 
 # constants of the order of those of Holzapfel, Gasser, Ogden (2000), tables 1 and 2
@@ -108,7 +89,7 @@ def exact_radius(layers: Mapping[str, Layer], pressure: float) -> float:
 
 def wall(cells: Sequence[int]) -> skfem.Mesh:
     """Return a quarter of the wall, of quadratic quadrilaterals; its layers are subdomains."""
-    mesh = rectangle([1.0, 1.0], [n + 1 for n in cells])
+    mesh = fem.rectangle([1.0, 1.0], [n + 1 for n in cells])
     inside = mesh.p[0, mesh.t].mean(axis=0) < (MIDDLE - INNER) / (OUTER - INNER)
     mesh = skfem.MeshQuad2.from_mesh(mesh)
     radius, angle = INNER + (OUTER - INNER) * mesh.doflocs[0], np.pi / 2 * mesh.doflocs[1]
@@ -121,20 +102,20 @@ def radius(
     layers: Mapping[str, Layer], pressure: float, cells: Sequence[int], bulk: float
 ) -> float:
     """Return r(A) / A for a ratio of bulk to shear modulus, the mean over the inner nodes."""
-    problem = Problem.build(
+    problem = fem.Problem.build(
         wall(cells),
         {name: layer.law(bulk) for name, layer in layers.items()},
         supports=[
-            DirichletBC(Plane(0, 0.0), [0.0, None]),
-            DirichletBC(Plane(1, 0.0), [None, 0.0]),
+            fem.DirichletBC(fem.Plane(0, 0.0), [0.0, None]),
+            fem.DirichletBC(fem.Plane(1, 0.0), [None, 0.0]),
         ],
-        follower_loads=[FollowerPressure(_inside, pressure)],
+        follower_loads=[fem.FollowerPressure(_inside, pressure)],
         mean_dilatation=True,
         length=1.0,
     )
     places = problem.points.numpy() + problem.origin
     inner = _inside(places)
-    displacement = balanced(Newton(problem, tol=TOL)).displacement[0].numpy()
+    displacement = balanced(fem.Newton(problem, tol=TOL)).displacement[0].numpy()
     return float(np.linalg.norm(places[inner] + displacement[inner], axis=1).mean()) / INNER
 
 

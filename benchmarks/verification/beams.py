@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from benchmarks import peers
+from benchmarks.study import picture
 from benchmarks.verification.bodies import NAMES, Array, balanced, paper_beam
-from benchmarks.verification.drawing import curve, measured, panel, picture, reference, triangle
+from benchmarks.verification.drawing import curve, measured, panel, reference, triangle
 from benchmarks.verification.report import Row, Section
 from dpl.fem import Material, NeoHookeanLn, Newton, Plane, Problem, SaintVenantKirchhoff, Traction
 

@@ -13,11 +13,7 @@ Array = NDArray[np.float64]
 
 
 def balanced(newton: Newton, force: Tensor | None = None, guess: Tensor | None = None) -> Solution:
-    """Return the solution under nodal forces (N, D) [-]; without forces, under moved supports.
-
-    Raises:
-        ArithmeticError: Newton does not converge.
-    """
+    """Return the solution under nodal forces (N, D) [-]; without forces, under moved supports."""
     force = torch.zeros(newton.problem.shape, dtype=torch.float64) if force is None else force
     load = Load(force[None], torch.ones(1, dtype=torch.float64))
     *_, last = newton.iterate(load, guess=guess)

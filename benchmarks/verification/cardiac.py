@@ -12,22 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.study import picture
 from benchmarks.verification.bodies import balanced
-from benchmarks.verification.drawing import measured, panel, picture
+from benchmarks.verification.drawing import measured, panel
 from benchmarks.verification.report import Row, Section
 from benchmarks.verification.ventricle import apex, endocardium, ventricle
-from dpl.fem import (
-    ConstantFibres,
-    DirichletBC,
-    FibreReinforced,
-    FollowerPressure,
-    Guccione,
-    Newton,
-    Plane,
-    Problem,
-    VolumetricK4,
-    box,
-)
+from dpl import fem
 
 Cells = tuple[int, int, int]
 SPREAD = 5e-3  # between the codes of the paper
@@ -39,20 +29,20 @@ VENTRICLES: tuple[Cells, ...] = ((2, 6, 1), (2, 8, 2), (4, 14, 3))  # patch, rin
 BULKS = (1e2, 1e3, 1e4, 1e5)  # [kPa]; the last is 1e4 times the shear moduli at rest and more
 
 
-def beam(cells: Cells, bulk: float) -> Problem:
+def beam(cells: Cells, bulk: float) -> fem.Problem:
     """Return the bar 10 x 1 x 1 mm with fibres along x; cells are smaller near the fixed end."""
-    mesh = box([1.0, 1.0, 1.0], [n + 1 for n in cells])
+    mesh = fem.box([1.0, 1.0, 1.0], [n + 1 for n in cells])
     x, y, z = mesh.p
-    law = FibreReinforced(
-        VolumetricK4(bulk), Guccione(2.0, 8.0, 2.0, 4.0), ConstantFibres([1, 0, 0])
+    law = fem.FibreReinforced(
+        fem.VolumetricK4(bulk), fem.Guccione(2.0, 8.0, 2.0, 4.0), fem.ConstantFibres([1, 0, 0])
     )
-    return Problem.build(
+    return fem.Problem.build(
         replace(mesh, doflocs=np.stack([10 * x**2, y, z])),
         law,
-        fixed=Plane(0, "min"),
+        fixed=fem.Plane(0, "min"),
         degree=2,
         mean_dilatation=True,
-        follower_loads=[FollowerPressure(Plane(2, "min"), 0.004)],
+        follower_loads=[fem.FollowerPressure(fem.Plane(2, "min"), 0.004)],
         length=1.0,
     )
 
@@ -62,34 +52,34 @@ def beam_tip(cells: Cells, bulk: float = BULKS[-1]) -> tuple[float, int]:
     problem = beam(cells, bulk)
     points = problem.points.numpy() + problem.origin
     node = int(np.linalg.norm(points - [10.0, 0.5, 1.0], axis=1).argmin())
-    solution = balanced(Newton(problem, tol=TOL))
+    solution = balanced(fem.Newton(problem, tol=TOL))
     return 1.0 + float(solution.displacement[0, node, 2]), int(solution.iterations)
 
 
-def inflated(cells: Cells, bulk: float) -> Problem:
+def inflated(cells: Cells, bulk: float) -> fem.Problem:
     """Return a quarter of the isotropic ventricle under 10 kPa."""
-    law = FibreReinforced(
-        VolumetricK4(bulk), Guccione(10.0, 1.0, 1.0, 1.0), ConstantFibres([1, 0, 0])
+    law = fem.FibreReinforced(
+        fem.VolumetricK4(bulk), fem.Guccione(10.0, 1.0, 1.0, 1.0), fem.ConstantFibres([1, 0, 0])
     )
-    return Problem.build(
+    return fem.Problem.build(
         ventricle(*cells, quarter=True),
         law,
         supports=[
-            DirichletBC(Plane(0, 0.0), [0.0, None, None]),
-            DirichletBC(Plane(1, 0.0), [None, 0.0, None]),
-            DirichletBC(Plane(2, "max")),
+            fem.DirichletBC(fem.Plane(0, 0.0), [0.0, None, None]),
+            fem.DirichletBC(fem.Plane(1, 0.0), [None, 0.0, None]),
+            fem.DirichletBC(fem.Plane(2, "max")),
         ],
         degree=2,
         mean_dilatation=True,
-        follower_loads=[FollowerPressure(endocardium, 10.0)],
+        follower_loads=[fem.FollowerPressure(endocardium, 10.0)],
         length=1.0,
     )
 
 
-def apex_of(problem: Problem) -> tuple[float, float, int]:
+def apex_of(problem: fem.Problem) -> tuple[float, float, int]:
     """Return z [mm] of the deformed apex, inside and outside, and the iterations from rest."""
     points = problem.points.numpy() + problem.origin
-    solution = balanced(Newton(problem, tol=TOL))
+    solution = balanced(fem.Newton(problem, tol=TOL))
     u = solution.displacement[0]
     nodes = [apex(points, depth) for depth in (0.0, 1.0)]
     inner, outer = (points[node, 2] + float(u[node, 2]) for node in nodes)

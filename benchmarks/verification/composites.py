@@ -11,8 +11,9 @@ import skfem
 from numpy.typing import NDArray
 from torch import Tensor
 
+from benchmarks.study import picture
 from benchmarks.verification.bodies import Array, balanced
-from benchmarks.verification.drawing import measured, panel, picture
+from benchmarks.verification.drawing import measured, panel
 from benchmarks.verification.report import Row, Section
 from dpl.fem import DirichletBC, LinearElastic, LinearSolver, Newton, Plane, Problem, box
 from dpl.fem.loads import traction
@@ -98,9 +99,6 @@ def eshelby(remote: Sequence[float]) -> Array:
 
     Source: Eshelby (1957), Proc. R. Soc. A 241, eq. 3.15: alpha and beta of the ball are the parts
     of a free strain that remain. Both bodies have the Poisson's ratio `POISSON`.
-
-    Args:
-        remote: Remote principal strains.
     """
     alpha = (1 + POISSON) / (3 * (1 - POISSON))
     beta = 2 * (4 - 5 * POISSON) / (15 * (1 - POISSON))

@@ -6,36 +6,27 @@ those of `benchmarks.verification.cardiac`.
 
 from pathlib import Path
 
+from benchmarks.study import picture
 from benchmarks.verification.cardiac import BULKS, SPREAD, apex_of
-from benchmarks.verification.drawing import measured, panel, picture
+from benchmarks.verification.drawing import measured, panel
 from benchmarks.verification.report import Row, Section
 from benchmarks.verification.ventricle import endocardium, fibres, ventricle
-from dpl.fem import (
-    ActiveStress,
-    DirichletBC,
-    FibreFunction,
-    FibreReinforced,
-    FollowerPressure,
-    Guccione,
-    Plane,
-    Problem,
-    VolumetricK4,
-)
+from dpl import fem
 
 ENDO, EPI = "-12.347", "-15.452"  # z of the deformed apex [mm]
 MESHES = ((2, 6, 2), (3, 9, 3), (4, 12, 4))  # patch, rings, layers
 
 
-def contracted(patch: int, rings: int, layers: int, bulk: float = BULKS[-1]) -> Problem:
+def contracted(patch: int, rings: int, layers: int, bulk: float = BULKS[-1]) -> fem.Problem:
     """Return the ventricle under 15 kPa with an active stress of 60 kPa along its fibres."""
-    muscle = Guccione(2.0, 8.0, 2.0, 4.0)
-    return Problem.build(
+    muscle = fem.Guccione(2.0, 8.0, 2.0, 4.0)
+    return fem.Problem.build(
         ventricle(patch, rings, layers),
-        FibreReinforced(VolumetricK4(bulk), muscle, FibreFunction(fibres)),
-        supports=[DirichletBC(Plane(2, "max"))],
+        fem.FibreReinforced(fem.VolumetricK4(bulk), muscle, fem.FibreFunction(fibres)),
+        supports=[fem.DirichletBC(fem.Plane(2, "max"))],
         degree=2,
         mean_dilatation=True,
-        follower_loads=[FollowerPressure(endocardium, 15.0), ActiveStress(60.0)],
+        follower_loads=[fem.FollowerPressure(endocardium, 15.0), fem.ActiveStress(60.0)],
         length=1.0,
     )
 

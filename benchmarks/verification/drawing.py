@@ -1,10 +1,6 @@
 """Figures in one style: black for references, colour for dpl, readable without colour."""
 
-import io
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,26 +9,9 @@ from torch import Tensor
 
 from benchmarks.verification.bodies import Array, lattice
 from dpl.fem import Problem
-from dpl.visualization import COLOURS, DPI, STYLE
+from dpl.visualization import COLOURS
 
 MARKS = "osD^vP"
-
-
-@contextmanager
-def picture(path: Path, height: float = 3.1) -> Iterator[Any]:
-    """Yield an empty figure of page width and write it to a file at the end."""
-    import matplotlib
-    from matplotlib.figure import Figure
-    from PIL import Image
-
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.4, height))
-        figure.set_layout_engine("constrained", w_pad=0.06, wspace=0.05)
-        yield figure
-        drawn = io.BytesIO()
-        figure.savefig(drawn, dpi=DPI)
-    palette = Image.open(drawn).convert("RGB").quantize(128)  # a third of the size
-    palette.save(path, optimize=True)
 
 
 def panel(figure: Any, place: int, x: str, y: str, title: str = "", **options: Any) -> Any:

@@ -11,21 +11,11 @@ import skfem
 import torch
 from torch import Tensor
 
+from benchmarks.study import picture
 from benchmarks.verification.bodies import Array
-from benchmarks.verification.drawing import measured, panel, picture
+from benchmarks.verification.drawing import measured, panel
 from benchmarks.verification.report import Row, Section
-from dpl.fem import (
-    LinearElastic,
-    LinearSolver,
-    Load,
-    Newton,
-    Plane,
-    Problem,
-    Traction,
-    box,
-    rectangle,
-    solve,
-)
+from dpl import fem
 from dpl.fem.postprocess import at_nodes, cauchy, von_mises
 
 LOAD = 1e-6  # traction and pressure over E [-]: small strains
@@ -33,19 +23,12 @@ NU = 0.3
 
 
 class Body(NamedTuple):
-    """A solved body with its exact stress.
+    """A solved body with its exact stress."""
 
-    Attributes:
-        problem: The body.
-        stress: Cauchy stress over E at the quadrature points, (1, E, Q, 3, 3) [-].
-        exact: Exact stress over E at the nodes, (N, 3, 3) [-].
-        surface: Mask of the nodes whose stress is compared, (N,).
-    """
-
-    problem: Problem
-    stress: Tensor
-    exact: Tensor
-    surface: Tensor
+    problem: fem.Problem  # the body
+    stress: Tensor  # cauchy stress over E at the quadrature points, (1, E, Q, 3, 3) [-]
+    exact: Tensor  # exact stress over E at the nodes, (N, 3, 3) [-]
+    surface: Tensor  # mask of the nodes whose stress is compared, (N,)
 
 
 def beam(cells: Sequence[int], cell: str, degree: int) -> Body:
@@ -53,12 +36,12 @@ def beam(cells: Sequence[int], cell: str, degree: int) -> Body:
 
     The surface consists of the nodes at z = 0 and z = 1 in the middle half of the length.
     """
-    mesh = box([4.0, 1.0, 1.0], [n + 1 for n in cells], cell)
-    problem = Problem.build(
-        mesh, LinearElastic(0.0), fixed=Plane(0, "min"), degree=degree, length=1.0
+    mesh = fem.box([4.0, 1.0, 1.0], [n + 1 for n in cells], cell)
+    problem = fem.Problem.build(
+        mesh, fem.LinearElastic(0.0), fixed=fem.Plane(0, "min"), degree=degree, length=1.0
     )
-    force = Traction(Plane(0, "max"), [0.0, 0.0, LOAD]).on(problem)
-    u = LinearSolver(problem).solve(force)
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, LOAD]).on(problem)
+    u = fem.LinearSolver(problem).solve(force)
     x, _, z = problem.points.T
     z, inertia = z - 0.5, 1 / 12
     exact = torch.zeros(len(x), 3, 3, dtype=torch.float64)
@@ -72,12 +55,12 @@ def cylinder(cells: Sequence[int], cell: str, degree: int) -> Body:
 
     Lame's displacement is prescribed on both radii. The surface is the inner one.
     """
-    mesh = rectangle([1.0, 1.0], [n + 1 for n in cells], cell)
+    mesh = fem.rectangle([1.0, 1.0], [n + 1 for n in cells], cell)
     if degree == 2:
         mesh = {"triangle": skfem.MeshTri2, "quad": skfem.MeshQuad2}[cell].from_mesh(mesh)
     radius, angle = 1 + mesh.doflocs[0], np.pi / 2 * mesh.doflocs[1]
     mesh = replace(mesh, doflocs=radius * np.stack([np.cos(angle), np.sin(angle)]))
-    build = partial(Problem.build, mesh, LinearElastic(NU), degree=degree, length=1.0)
+    build = partial(fem.Problem.build, mesh, fem.LinearElastic(NU), degree=degree, length=1.0)
     points = build().points.numpy()
     r = np.linalg.norm(points, axis=1, keepdims=True)
     k = LOAD / 3
@@ -85,8 +68,8 @@ def cylinder(cells: Sequence[int], cell: str, degree: int) -> Body:
     fixed = points < 1e-9  # symmetry
     fixed |= (r < 1 + 1e-9) | (r > 2 - 1e-9)
     problem = build(fixed=fixed, prescribed=u)
-    none = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
-    found = solve(Newton(problem), none).displacement
+    none = fem.Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
+    found = fem.solve(fem.Newton(problem), none).displacement
     exact = _lame(points, r, k)
     return Body(problem, cauchy(problem, found), exact, torch.from_numpy(r[:, 0] < 1 + 1e-9))
 
@@ -102,7 +85,7 @@ def _lame(points: Array, r: Array, k: float) -> Tensor:
     return torch.from_numpy(stress)
 
 
-def mean_of_cells(problem: Problem, values: Tensor) -> Tensor:
+def mean_of_cells(problem: fem.Problem, values: Tensor) -> Tensor:
     """Return the volume-weighted means (1, N, 3, 3) over the cells at each node."""
     dV = problem.dV.expand(len(problem.cells), -1)
     spread = (values[0] * dV[..., None, None]).sum(dim=1).flatten(1)  # (E, 9)
@@ -113,7 +96,7 @@ def mean_of_cells(problem: Problem, values: Tensor) -> Tensor:
     return (total / volume[:, None]).reshape(1, -1, 3, 3)
 
 
-def errors(body: Body, recover: Callable[[Problem, Tensor], Tensor]) -> tuple[float, float]:
+def errors(body: Body, recover: Callable[[fem.Problem, Tensor], Tensor]) -> tuple[float, float]:
     """Return the rms error of the stress over its rms, and mean von Mises stress over the exact."""
     found, exact = recover(body.problem, body.stress)[0][body.surface], body.exact[body.surface]
     rms = (found - exact).square().sum((1, 2)).mean() / exact.square().sum((1, 2)).mean()

@@ -15,24 +15,11 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from torch import Tensor
 
+from benchmarks.study import picture
 from benchmarks.verification.bodies import Array
-from benchmarks.verification.drawing import measured, panel, picture
+from benchmarks.verification.drawing import measured, panel
 from benchmarks.verification.report import Row, Section
-from dpl.fem import (
-    FollowerPressure,
-    Load,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    Solution,
-    Status,
-    Tag,
-    box,
-    finger,
-    rectangle,
-    solve,
-)
+from dpl import fem
 
 INNER, OUTER = 1.0, 2.0  # radii [m]
 FINGER = (160.0, 16.0, 16.0)  # sides of the finger [mm]
@@ -90,12 +77,12 @@ def expanded_radius(nu: float, pressure: float, dim: int) -> float:
 def sector(dim: int, cells: int, shape: str, *, quadratic: bool) -> skfem.Mesh:
     """Return a quarter of the cylinder, or an octant of the sphere; `cells` through the wall."""
     if dim == 2:
-        mesh = rectangle([1.0, 1.0], [cells + 1, 2 * cells + 1], shape)
+        mesh = fem.rectangle([1.0, 1.0], [cells + 1, 2 * cells + 1], shape)
         if quadratic:
             mesh = {"triangle": skfem.MeshTri2, "quad": skfem.MeshQuad2}[shape].from_mesh(mesh)
         radius, angle = INNER + mesh.doflocs[0], np.pi / 2 * mesh.doflocs[1]
         return replace(mesh, doflocs=radius * np.stack([np.cos(angle), np.sin(angle)]))
-    patch = box([1.0] * 3, [cells + 1] * 3)  # coordinates: radius and two of a side of a cube
+    patch = fem.box([1.0] * 3, [cells + 1] * 3)  # coordinates: radius and two of a side of a cube
     radius = INNER + patch.p[0]
     at = radius * np.stack([patch.p[1], patch.p[2], np.ones_like(radius)])
     parts = [skfem.MeshHex(np.roll(at, k, axis=0), patch.t) for k in range(3)]
@@ -112,9 +99,11 @@ def inner_surface(points: Array) -> NDArray[np.bool_]:
 
 def expansion(nu: float, pressure: float, mesh: skfem.Mesh, degree: int, **options: Any) -> float:
     """Return r(A) / A of a sector with symmetry conditions: the mean over the inner surface."""
-    build = partial(Problem.build, mesh, NeoHookeanLn(nu), degree=degree, length=1.0, **options)
+    build = partial(
+        fem.Problem.build, mesh, fem.NeoHookeanLn(nu), degree=degree, length=1.0, **options
+    )
     points = build().points.numpy()
-    inflate = FollowerPressure(inner_surface, pressure)
+    inflate = fem.FollowerPressure(inner_surface, pressure)
     problem = build(fixed=points < 1e-9, follower_loads=[inflate])
     u = under_pressure(problem, 1.0).displacement[0]
     assert problem.follower_loads is not None
@@ -124,37 +113,31 @@ def expansion(nu: float, pressure: float, mesh: skfem.Mesh, degree: int, **optio
     return (volume / part / INNER**dim + 1) ** (1 / dim)
 
 
-def under_pressure(problem: Problem, factor: float, tol: float = 1e-10) -> Solution:
+def under_pressure(problem: fem.Problem, factor: float, tol: float = 1e-10) -> fem.Solution:
     """Return the equilibrium under a part of the pressure and no other load."""
-    newton = Newton(problem.under(factor), tol=tol)
-    found = solve(newton, Load(torch.zeros(1, *problem.shape).double(), torch.ones(1)))
-    assert found.converged.all(), str(Status(int(found.status)))
+    newton = fem.Newton(problem.under(factor), tol=tol)
+    found = fem.solve(newton, fem.Load(torch.zeros(1, *problem.shape).double(), torch.ones(1)))
+    assert found.converged.all(), str(fem.Status(int(found.status)))
     return found
 
 
-def pneumatic_finger(cells: Sequence[int], pressure: float) -> Problem:
+def pneumatic_finger(cells: Sequence[int], pressure: float) -> fem.Problem:
     """Return the finger of `dpl.fem.finger`, fixed at x = 0, E = 1."""
-    return Problem.build(
-        finger(FINGER, cells),
-        NeoHookeanLn(0.4),
-        fixed=Plane(0, "min"),
+    return fem.Problem.build(
+        fem.finger(FINGER, cells),
+        fem.NeoHookeanLn(0.4),
+        fixed=fem.Plane(0, "min"),
         mean_dilatation=True,
-        follower_loads=[FollowerPressure(Tag("chamber"), pressure)],
+        follower_loads=[fem.FollowerPressure(fem.Tag("chamber"), pressure)],
     )
 
 
 class Balance(NamedTuple):
-    """Energies of a finger under its whole pressure.
+    """Energies of a finger under its whole pressure."""
 
-    Attributes:
-        strain: Strain energy over E L^3 [-].
-        work: Work of the pressure, the integral of p dV [-].
-        tip: Deflection of the tip over L [-].
-    """
-
-    strain: float
-    work: float
-    tip: float
+    strain: float  # strain energy over E L^3 [-]
+    work: float  # work of the pressure, the integral of p dV [-]
+    tip: float  # deflection of the tip over L [-]
 
 
 def energy_balance(

@@ -10,24 +10,11 @@ import skfem
 import torch
 from torch import Tensor
 
+from benchmarks.study import picture
 from benchmarks.verification.bodies import NAMES, Array, balanced, lattice
-from benchmarks.verification.drawing import measured, panel, picture, reference, side, triangle
+from benchmarks.verification.drawing import measured, panel, reference, side, triangle
 from benchmarks.verification.report import Row, Section
-from dpl.fem import (
-    FollowerPressure,
-    LinearSolver,
-    Material,
-    NeoHookeanIsoK2,
-    NeoHookeanIsoK4,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Traction,
-    box,
-    rectangle,
-)
+from dpl import fem
 from dpl.fem.loads import body_force
 from dpl.visualization import COLOURS
 
@@ -56,14 +43,14 @@ def manufactured(x: Tensor, amplitude: float = 0.1) -> Tensor:
 
 
 def errors(
-    cell: str, degree: int, n: int, law: Material | None = None, amplitude: float = 0.1,
+    cell: str, degree: int, n: int, law: fem.Material | None = None, amplitude: float = 0.1,
     *, mean_dilatation: bool = False,
 ) -> tuple[float, float]:  # fmt: skip
     """Return the errors of the manufactured solution on n^3 cells in L2 and the H1-seminorm [-].
 
     The law is NH-ln with a Poisson's ratio of 0.3 if left out.
     """
-    law = law or NeoHookeanLn(0.3)
+    law = law or fem.NeoHookeanLn(0.3)
     exact = partial(manufactured, amplitude=amplitude)
     gradient = torch.func.jacrev(exact)
 
@@ -77,15 +64,15 @@ def errors(
         values = torch.func.vmap(what)(torch.from_numpy(x.reshape(3, -1).T.copy()))
         return np.moveaxis(values.numpy(), 0, -1).reshape(*values.shape[1:], *x.shape[1:])
 
-    mesh = box([1.0] * 3, [n + 1] * 3, cell)
-    bare = Problem.build(mesh, law, degree=degree, length=1.0)
+    mesh = fem.box([1.0] * 3, [n + 1] * 3, cell)
+    bare = fem.Problem.build(mesh, law, degree=degree, length=1.0)
     given = torch.func.vmap(exact)(bare.points).numpy()
-    problem = Problem.build(
+    problem = fem.Problem.build(
         mesh, law, fixed=bare.boundary.numpy(), prescribed=given, degree=degree, length=1.0,
         mean_dilatation=mean_dilatation,
     )  # fmt: skip
     force = body_force(problem, lambda x: at(load, x))
-    answer = balanced(Newton(problem), force).displacement[0].numpy()
+    answer = balanced(fem.Newton(problem), force).displacement[0].numpy()
     fine = skfem.Basis(mesh, problem.basis.elem, intorder=7)
     x = np.asarray(fine.global_coordinates())
     u, slope = at(exact, x), at(gradient, x)
@@ -149,25 +136,25 @@ COOK = {  # displacement u_y at (48, 52) [mm] on SIDES cells a side: deal.II
     2: "14.30 14.65 14.71 14.73 14.74 14.74",
 }
 FINER = {1: "8.6384 12.0712 13.8632 14.4853", 2: "14.3018 14.6494 14.7139"}  # independent code
-OTHERS: list[tuple[str, Material, int, str]] = [  # 8 x 8 cells, independent code
-    ("NH-ln", NeoHookeanLn(0.3), 1, "13.700585"),
-    ("NH-ln", NeoHookeanLn(0.3), 2, "14.4831"),
-    ("SVK", SaintVenantKirchhoff(0.3), 2, "13.6261"),
+OTHERS: list[tuple[str, fem.Material, int, str]] = [  # 8 x 8 cells, independent code
+    ("NH-ln", fem.NeoHookeanLn(0.3), 1, "13.700585"),
+    ("NH-ln", fem.NeoHookeanLn(0.3), 2, "14.4831"),
+    ("SVK", fem.SaintVenantKirchhoff(0.3), 2, "13.6261"),
 ]
 
 
-def membrane(law: Material, n: int, degree: int) -> tuple[Problem, Tensor]:
+def membrane(law: fem.Material, n: int, degree: int) -> tuple[fem.Problem, Tensor]:
     """Return Cook's membrane of n^2 cells in plane strain with its displacement [mm]."""
-    mesh = rectangle([1.0, 1.0], [n + 1, n + 1])
+    mesh = fem.rectangle([1.0, 1.0], [n + 1, n + 1])
     x, y = mesh.p
     mesh = type(mesh)(np.stack([48 * x, 44 * x + y * (44 - 28 * x)]), mesh.t)
-    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
+    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=degree)
     young = 0.4225 * 2.6  # [N/mm2], of mu = 0.4225 and nu = 0.3
-    force = Traction(Plane(0, "max"), [0.0, 1 / 16 / young]).on(problem)
-    return problem, balanced(Newton(problem), force).displacement[0] * problem.length
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 1 / 16 / young]).on(problem)
+    return problem, balanced(fem.Newton(problem), force).displacement[0] * problem.length
 
 
-def at(problem: Problem, field: Tensor, place: Sequence[float]) -> tuple[float, ...]:
+def at(problem: fem.Problem, field: Tensor, place: Sequence[float]) -> tuple[float, ...]:
     """Return a nodal field (N, D) at the node nearest a place [of the unit of `length`]."""
     away = problem.points * problem.length - torch.tensor(place, dtype=torch.float64)
     return tuple(field[int(away.norm(dim=1).argmin())].tolist())
@@ -175,7 +162,7 @@ def at(problem: Problem, field: Tensor, place: Sequence[float]) -> tuple[float, 
 
 def cook(folder: Path) -> Section:
     """Refine Cook's membrane."""
-    found = {(d, n): membrane(NeoHookeanIsoK4(0.3), n, d) for d in COOK for n in SIDES}
+    found = {(d, n): membrane(fem.NeoHookeanIsoK4(0.3), n, d) for d in COOK for n in SIDES}
     tips = {case: at(*body, (48, 52))[1] for case, body in found.items()}
     rows = []
     for source, table in (("deal.II", COOK), ("independent code", FINER)):
@@ -202,7 +189,7 @@ def cook(folder: Path) -> Section:
 
 
 def _draw_membrane(
-    path: Path, tips: dict[tuple[int, int], float], problem: Problem, u: Tensor
+    path: Path, tips: dict[tuple[int, int], float], problem: fem.Problem, u: Tensor
 ) -> None:
     with picture(path, 3.3) as figure:
         ax = panel(figure, 1, "cells a side [-]", "u$_y$ at (48, 52) [mm]", "(a)", xscale="log")
@@ -244,11 +231,13 @@ def compliance(
     nu: float, cells: Sequence[int], cell: str, degree: int, mean: bool = False
 ) -> float:
     """Return f u of the paper's beam under a small dead load across its end."""
-    mesh = box([4.0, 1.0, 1.0], [n + 1 for n in cells], cell)
-    law = NeoHookeanLn(nu)
-    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree, mean_dilatation=mean)
-    force = Traction(Plane(0, "max"), [0.0, 0.0, -1.0]).on(problem)
-    return float((force * LinearSolver(problem).solve(force)).sum())
+    mesh = fem.box([4.0, 1.0, 1.0], [n + 1 for n in cells], cell)
+    law = fem.NeoHookeanLn(nu)
+    problem = fem.Problem.build(
+        mesh, law, fixed=fem.Plane(0, "min"), degree=degree, mean_dilatation=mean
+    )
+    force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -1.0]).on(problem)
+    return float((force * fem.LinearSolver(problem).solve(force)).sum())
 
 
 def bending(ratio: float, degree: int, *, mean: bool = True) -> tuple[float, int]:
@@ -259,17 +248,17 @@ def bending(ratio: float, degree: int, *, mean: bool = True) -> tuple[float, int
     6 x 2 x 2 of degree 2, with mean dilatation or without it.
     """
     counts = [13, 4, 4] if degree == 1 else [7, 3, 3]
-    law = NeoHookeanIsoK2((3 * ratio - 2) / (6 * ratio + 2))
-    problem = Problem.build(
-        box([4.0, 1.0, 1.0], counts),
+    law = fem.NeoHookeanIsoK2((3 * ratio - 2) / (6 * ratio + 2))
+    problem = fem.Problem.build(
+        fem.box([4.0, 1.0, 1.0], counts),
         law,
-        fixed=Plane(0, "min"),
+        fixed=fem.Plane(0, "min"),
         degree=degree,
         mean_dilatation=mean,
-        follower_loads=[FollowerPressure(Plane(2, "max"), 0.004)],
+        follower_loads=[fem.FollowerPressure(fem.Plane(2, "max"), 0.004)],
         length=1.0,
     )
-    solution = balanced(Newton(problem, tol=1e-6))
+    solution = balanced(fem.Newton(problem, tol=1e-6))
     return float(solution.displacement.abs().max()), int(solution.iterations)
 
 

@@ -8,18 +8,12 @@ from decimal import Decimal
 
 @dataclass(frozen=True)
 class Row:
-    """A measured quantity with its reference.
+    """A measured quantity with its reference."""
 
-    Attributes:
-        quantity: Name of the quantity.
-        reference: Digits as the source prints them; "< 1e-10" or "> 0.94" is a bound.
-        value: The measured value.
-        within: Relative difference allowed; None: one unit of the last digit printed.
-    """
-
-    quantity: str
-    reference: str
-    value: float
+    quantity: str  # name of the quantity
+    reference: str  # digits as the source prints them; "< 1e-10" or "> 0.94" is a bound
+    value: float  # the measured value
+    # relative difference allowed; None: one unit of the last digit printed
     within: float | None = None
 
     @property
@@ -61,23 +55,14 @@ class Row:
 
 @dataclass(frozen=True)
 class Section:
-    """Results of a case.
+    """Results of a case."""
 
-    Attributes:
-        title: Title of the section.
-        source: Source of the references.
-        text: Description of the problem and of its tolerances.
-        rows: All values.
-        note: What is surprising.
-        seconds: Run time [s].
-    """
-
-    title: str
-    source: str
-    text: str
-    rows: list[Row]
-    note: str = ""
-    seconds: float = 0.0
+    title: str  # title of the section
+    source: str  # source of the references
+    text: str  # description of the problem and of its tolerances
+    rows: list[Row]  # all values
+    note: str = ""  # what is surprising
+    seconds: float = 0.0  # run time [s]
 
 
 def summary(

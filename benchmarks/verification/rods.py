@@ -11,23 +11,15 @@ from scipy.optimize import brentq
 from scipy.special import ellipeinc, ellipk, ellipkinc
 from torch import Tensor
 
+from benchmarks.study import picture
 from benchmarks.verification.bodies import Array, balanced, lattice, mean, slender
-from benchmarks.verification.drawing import curve, measured, panel, picture, reference, side
+from benchmarks.verification.drawing import curve, measured, panel, reference, side
 from benchmarks.verification.report import Row, Section
-from dpl.fem import (
-    Material,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    SaintVenantKirchhoff,
-    Status,
-    Traction,
-)
+from dpl import fem
 from dpl.fem.linear import make_backend
 from dpl.visualization import COLOURS
 
-SVK = SaintVenantKirchhoff(0.0)
+SVK = fem.SaintVenantKirchhoff(0.0)
 BENT = {  # P L^2 / EI: w / L and u / L of the tip, by elliptic integrals
     0.1: (".033295319", ".00066539996"),
     0.2: (".066364482", ".0026465483"),
@@ -103,8 +95,8 @@ def elastica(folder: Path) -> Section:
     found, shapes = {}, {}
     for name, (cells, cell, degree) in KINDS.items():
         problem = slender(SVK, cells, cell, degree)
-        newton = Newton(problem)
-        unit = Traction(Plane(0, "max"), [0.0, 0.0, -1 / 12 / 400]).on(problem)
+        newton = fem.Newton(problem)
+        unit = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -1 / 12 / 400]).on(problem)
         for load in BENT:
             u = balanced(newton, load * unit).displacement[0]
             shapes[name, load] = problem, u
@@ -170,7 +162,9 @@ def _draw_bent(path: Path, found: Any, shapes: Any) -> None:
         ax.set(xlim=(-0.03, 1.12), ylim=(-0.92, 0.08))
 
 
-def _draw_side(ax: Any, problem: Problem, u: Tensor, colour: str, at: float | None = None) -> None:
+def _draw_side(
+    ax: Any, problem: fem.Problem, u: Tensor, colour: str, at: float | None = None
+) -> None:
     """Draw a slender beam seen across; upright, at a place, if that is given."""
     nodes = lattice(problem.points.numpy())[:, 0]
     places = (problem.points + u).numpy()[:, [0, 2]]
@@ -179,26 +173,26 @@ def _draw_side(ax: Any, problem: Problem, u: Tensor, colour: str, at: float | No
 
 EULER = math.pi**2 / 4  # P L^2 / EI at which a column, clamped below, free above, buckles
 NEWTON = 100 / (1000 / 12)  # P L^2 / EI of 1 N on the column 10 x 1 x 1 m, E = 1000 Pa
-CRITICAL: list[tuple[Material, tuple[int, int, int], str]] = [  # [N]
+CRITICAL: list[tuple[fem.Material, tuple[int, int, int], str]] = [  # [N]
     (SVK, (10, 1, 1), "2.039763"),
     (SVK, (20, 2, 2), "2.037811"),
-    (NeoHookeanLn(0.0), (10, 1, 1), "2.056558"),
+    (fem.NeoHookeanLn(0.0), (10, 1, 1), "2.056558"),
 ]
 BUCKLED = {2.5: (".6873", ".3885"), 4.0: (".7925", ".9731")}  # P [N]: w / L, u / L, SVK, L/h = 10
 POST = {2.5: (".66363", ".34682"), 4.0: (".80022", ".90518")}  # the same, elastica
 LOADS = (4.0, 3.75, 3.5, 3.25, 3.0, 2.75, 2.5, 2.35, 2.2, 2.12, 2.08, 2.06, 2.05)  # [N]
 
 
-def pushed(problem: Problem, P: float) -> Tensor:
+def pushed(problem: fem.Problem, P: float) -> Tensor:
     """Return the forces (N, D) [-] on a slender column whose P L^2 / EI is that of P [N]."""
     thick = float(problem.points[:, 1].max())
-    return Traction(Plane(0, "max"), [-P * NEWTON * thick**2 / 12, 0.0, 0.0]).on(problem)
+    return fem.Traction(fem.Plane(0, "max"), [-P * NEWTON * thick**2 / 12, 0.0, 0.0]).on(problem)
 
 
-def critical(law: Material, cells: Sequence[int]) -> float:
+def critical(law: fem.Material, cells: Sequence[int]) -> float:
     """Return the load P [N] at which the tangent of a straight column becomes singular."""
     problem = slender(law, cells)
-    newton, unit = Newton(problem, tol=1e-10), pushed(problem, 1.0)
+    newton, unit = fem.Newton(problem, tol=1e-10), pushed(problem, 1.0)
     tangents, low, high = make_backend(problem.pattern), 2.0, 2.1
     while high - low > 2e-7:
         middle = (low + high) / 2
@@ -208,13 +202,13 @@ def critical(law: Material, cells: Sequence[int]) -> float:
     return (low + high) / 2
 
 
-def bent_branch(cells: Sequence[int], lowest: float) -> dict[float, tuple[Problem, Any, Any]]:
+def bent_branch(cells: Sequence[int], lowest: float) -> dict[float, tuple[fem.Problem, Any, Any]]:
     """Return body, solution and tip (w/L, u/L) of a buckled column by loads [N].
 
     The first answer is reached by a guess, the elastica's shape; each of the others by the last.
     """
     problem = slender(SVK, cells)
-    newton, unit = Newton(problem), pushed(problem, 1.0)
+    newton, unit = fem.Newton(problem), pushed(problem, 1.0)
     _, line, slopes = at_load(buckled_line, LOADS[0] * NEWTON / EULER)
     X = problem.points.numpy()
     x, z, slope = (np.interp(X[:, 0], np.linspace(0, 1, 200), v) for v in (*line.T, slopes))
@@ -241,7 +235,7 @@ def buckling(folder: Path) -> Section:
     lowest, slim = rows[1].value, critical(SVK, (40, 1, 1))
     rows.append(Row("SVK, L/h = 40: critical load [N], Euler", "2.056168", slim, 2e-3))
     problem = slender(SVK, (10, 1, 1))
-    answer = balanced(Newton(problem), pushed(problem, 2.5))
+    answer = balanced(fem.Newton(problem), pushed(problem, 2.5))
     down = 10 * float(answer.displacement[..., 0].min())
     rows += [
         Row("10 × 1 × 1, from rest, P = 2.5 N: u_x of the tip [m], same mesh", "-0.02509", down),
@@ -257,10 +251,10 @@ def buckling(folder: Path) -> Section:
                 name = f"L/h = {ratio}, bent, P = {P:g} N: {what}/L, {source}"
                 rows.append(Row(name, tip[k], branches[ratio][P][2][k], within))
     problem = slender(SVK, (20, 2, 2))
-    newton, unit = Newton(problem), pushed(problem, 1.0)
+    newton, unit = fem.Newton(problem), pushed(problem, 1.0)
     straight = {P: balanced(newton, P * unit) for P in np.arange(0.5, 4.1, 0.25).tolist()}
     _draw_buckled(folder / "buckling.png", problem, straight, branches)
-    flagged = [P for P, answer in straight.items() if answer.status == Status.UNSTABLE]
+    flagged = [P for P, answer in straight.items() if answer.status == fem.Status.UNSTABLE]
     bent = [answer.status for branch in branches.values() for _, answer, _ in branch.values()]
     return Section(
         "Buckling",
@@ -272,14 +266,14 @@ def buckling(folder: Path) -> Section:
         "From rest Newton finds the straight column at every load, with the status *unstable* "
         f"for {len(flagged)} of the {sum(lowest < P for P in straight)} loads above the critical "
         f"one, for {sum(lowest > P for P in flagged)} of {sum(lowest > P for P in straight)} "
-        f"below it, and for {bent.count(int(Status.UNSTABLE))} of {len(bent)} solutions on the "
+        f"below it, and for {bent.count(int(fem.Status.UNSTABLE))} of {len(bent)} solutions on the "
         "bent branches. The values in bold differ because the column with L/h = 10 shears and "
         f"shortens (critical load {100 * (1 - lowest / 2.056168):.1f} % below Euler's); the "
         "independent code has the same values.",
     )
 
 
-def _draw_buckled(path: Path, problem: Problem, straight: Any, branches: Any) -> None:
+def _draw_buckled(path: Path, problem: fem.Problem, straight: Any, branches: Any) -> None:
     unit = NEWTON / EULER
     with picture(path, 3.3) as figure:
         ax = panel(figure, 1, "load / Euler's critical load [-]", "deflection w/L [-]", "(a)")
@@ -291,13 +285,11 @@ def _draw_buckled(path: Path, problem: Problem, straight: Any, branches: Any) ->
             w = [tip[0] for *_, tip in branch.values()]
             loads = np.array([*branch]) * unit
             measured(ax, loads, w, k, f"bent, L/h = {ratio}", linestyle="none")
-        for k, status, how in (
-            *((2, Status.CONVERGED, "from rest, stable"),),
-            *((3, Status.UNSTABLE, "from rest, unstable"),),
-        ):
+        flags = {"stable": fem.Status.CONVERGED, "unstable": fem.Status.UNSTABLE}
+        for k, (how, status) in enumerate(flags.items(), 2):
             loads = np.array([P for P, answer in straight.items() if answer.status == status])
             style = {"marker": "x", "markersize": 5} if k == 3 else {}
-            measured(ax, loads * unit, 0 * loads, k, how, linestyle="none", **style)
+            measured(ax, loads * unit, 0 * loads, k, f"from rest, {how}", linestyle="none", **style)
         ax.set(xlim=(0.15, 2.05), ylim=(-0.05, 0.88), xticks=[0.5, 1, 1.5, 2])
         ax.legend(loc="upper left", bbox_to_anchor=(-0.02, 1.02))
         ax = panel(figure, 2, "z/L [-]", "x/L [-]", "(b)", aspect="equal")

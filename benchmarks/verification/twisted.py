@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.study import picture
 from benchmarks.verification.bodies import Array, balanced
-from benchmarks.verification.drawing import curve, measured, panel, picture, reference, solid
+from benchmarks.verification.drawing import curve, measured, panel, reference, solid
 from benchmarks.verification.report import Row, Section
 from dpl.fem import DirichletBC, NeoHookeanLn, Newton, Plane, Problem, box
 from dpl.visualization import COLOURS

@@ -8,35 +8,22 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.study import picture
 from benchmarks.verification.bodies import Array, balanced
-from benchmarks.verification.drawing import measured, panel, picture, reference
+from benchmarks.verification.drawing import measured, panel, reference
 from benchmarks.verification.report import Row, Section
-from dpl.fem import (
-    LinearElastic,
-    Material,
-    MooneyRivlinK2,
-    NeoHookeanIsoK2,
-    NeoHookeanIsoK4,
-    NeoHookeanLn,
-    Newton,
-    OgdenK2,
-    Problem,
-    SaintVenantKirchhoff,
-    StableNeoHookean,
-    YeohK2,
-    box,
-)
+from dpl import fem
 
 LAWS = {
-    "linear": LinearElastic(0.3),
-    "SVK": SaintVenantKirchhoff(0.3),
-    "NH-ln": NeoHookeanLn(0.3),
-    "NHiso-k2": NeoHookeanIsoK2(0.3),
-    "NHiso-k4": NeoHookeanIsoK4(0.3),
-    "SNH": StableNeoHookean(0.3),
-    "Mooney-Rivlin": MooneyRivlinK2(0.15, 0.05, 2.0),
-    "Yeoh": YeohK2(0.2, -0.02, 0.005, 2.0),
-    "Ogden": OgdenK2((0.3, 0.1, 0.02), (1.3, 5.0, -2.0), 2.0),
+    "linear": fem.LinearElastic(0.3),
+    "SVK": fem.SaintVenantKirchhoff(0.3),
+    "NH-ln": fem.NeoHookeanLn(0.3),
+    "NHiso-k2": fem.NeoHookeanIsoK2(0.3),
+    "NHiso-k4": fem.NeoHookeanIsoK4(0.3),
+    "SNH": fem.StableNeoHookean(0.3),
+    "Mooney-Rivlin": fem.MooneyRivlinK2(0.15, 0.05, 2.0),
+    "Yeoh": fem.YeohK2(0.2, -0.02, 0.005, 2.0),
+    "Ogden": fem.OgdenK2((0.3, 0.1, 0.02), (1.3, 5.0, -2.0), 2.0),
 }
 STRETCHES = (0.7, 0.9, 1.1, 1.5, 2.0)
 UNIAXIAL = {  # P11 / E and lateral stretch at each of STRETCHES
@@ -76,19 +63,19 @@ UNIAXIAL = {  # P11 / E and lateral stretch at each of STRETCHES
 }
 
 
-def pulled(law: Material, stretches: Sequence[float]) -> list[tuple[float, float]]:
+def pulled(law: fem.Material, stretches: Sequence[float]) -> list[tuple[float, float]]:
     """Return P11 / E and the lateral stretch of a cube stretched along x, its sides free."""
-    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    mesh = fem.box([1.0, 1.0, 1.0], [2, 2, 2])
     held = mesh.p.T == 0
     held[:, 0] |= mesh.p[0] == 1
-    rest = Problem.build(mesh, law, fixed=held, length=1.0)
+    rest = fem.Problem.build(mesh, law, fixed=held, length=1.0)
     far, end = int(rest.points.sum(dim=1).argmax()), rest.points[:, 0] == 1
     found = []
     for stretch in stretches:
         moved = torch.zeros_like(rest.points)
         moved[end, 0] = stretch - 1
         problem = replace(rest, prescribed=moved)
-        u = balanced(Newton(problem, tol=1e-12)).displacement
+        u = balanced(fem.Newton(problem, tol=1e-12)).displacement
         found.append((float(problem.internal_force(u)[0, end, 0].sum()), 1 + float(u[0, far, 1])))
     return found
 

@@ -1,6 +1,5 @@
 """Figures of reference and predicted shapes with the nodal errors of the predictions."""
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,6 @@ WIDE = 0.1  # part of the largest error below which a median error needs a logar
 SMALLEST_ERROR = 1e-12  # smallest upper end of a colour scale
 ELEVATION, AZIMUTH = np.deg2rad((18.0, -60.0))  # of the view
 PANEL = 3.2  # longer side of a panel [inch]
-MOST_ACROSS = 4  # panels of a single load side by side
 GAP, LINE, BAR = 0.08, 0.17, 0.12  # between panels, of a line of text, of a colour bar [inch]
 LABEL = "nodal error / L [-]"
 OUTSIDE = 0.5  # part of the size of a body that predictions extend a panel by at most
@@ -36,7 +34,6 @@ def plot_deformed(
     *,
     names: Sequence[str] = (),
     upright: bool = False,
-    logarithmic: bool = False,
     max_polygons: int | None = None,
 ) -> "Figure":
     """Return a figure of the reference shapes and of predicted shapes beside them.
@@ -52,7 +49,6 @@ def plot_deformed(
         predictions: Pairs of a name and displacements over L, (B, N, D) [-].
         names: Titles of the loads.
         upright: Put loads in rows and predictions in columns, for TensorBoard's narrow cards.
-        logarithmic: Make all scales logarithmic.
         max_polygons: Largest number of polygons per body, see `coarse`; None: all.
     """
     body = _Outlined(problem, max_polygons)
@@ -67,7 +63,7 @@ def plot_deformed(
             ax.set_title(names[load], fontsize=9, loc="left")
     for row, bar, field in zip(axes[1:], bars, fields, strict=True):
         error = np.linalg.norm(field - true, axis=2)
-        scale = error_scale(error, logarithmic=logarithmic)
+        scale = error_scale(error)
         for ax, u, exact, value in zip(row, field, true, error, strict=True):
             if np.isfinite(u).all():
                 body.draw(ax, body.points + u, scale.to_rgba(body.at_polygons(value)), "0.75")
@@ -156,19 +152,17 @@ def project(points: Array) -> tuple[Array, Array]:
     return seen[:, :2], seen[:, 2]
 
 
-def error_scale(error: Array, *, logarithmic: bool = False) -> "ScalarMappable":
+def error_scale(error: Array) -> "ScalarMappable":
     """Return a colour scale whose upper end is the largest finite error.
 
-    It is logarithmic over three decades if half of the positive errors are small, else linear;
-    with `logarithmic` it is logarithmic in any case.
+    It is logarithmic over three decades if half of the positive errors are small, else linear.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm, Normalize
 
     positive = error[np.isfinite(error) & (error > 0)]
     largest = float(positive.max(initial=SMALLEST_ERROR))
-    spread = bool(len(positive)) and bool(np.median(positive) < WIDE * largest)
-    if logarithmic or spread:
+    if len(positive) and np.median(positive) < WIDE * largest:
         return ScalarMappable(LogNorm(largest * DECADES, largest, clip=True), "viridis")
     return ScalarMappable(Normalize(0.0, largest, clip=True), "viridis")
 
@@ -197,8 +191,7 @@ def _grid(
 ) -> tuple["Figure", Any, Any]:
     """Return a figure, its axes (1 + predictions, loads), and axes of the colour bars.
 
-    The panels have the shape of the body. There are `titles` lines above a load. The predictions
-    of a single load continue in a next line where there are many.
+    The panels have the shape of the body. There are `titles` lines above a load.
     """
     from matplotlib.figure import Figure
 
@@ -206,12 +199,9 @@ def _grid(
     width, height = (high - low) * min(PANEL / (high - low))
     top, loads = 0.08 + LINE * titles, len(extents)
     left, below, right = (0.05, 0.75, 0.05) if upright else (0.25, 0.05, 0.85)
-    across = min(rows, MOST_ACROSS) if upright and loads == 1 else rows
-    folds = math.ceil(rows / across)
-    columns, lines = (across, loads * folds) if upright else (loads, rows)
-    between = below if folds > 1 else 0.0
-    step = height + (top if upright else 0.0) + GAP + between
-    tall = below + lines * step - between + (0 if upright else top)
+    columns, lines = (rows, loads) if upright else (loads, rows)
+    step = height + (top if upright else 0.0) + GAP
+    tall = below + lines * step + (0 if upright else top)
     size = left + columns * (width + GAP) + right, tall
     figure = Figure(figsize=size, dpi=DPI)
     figure.set_layout_engine("none")  # panels are placed here, whatever the style says
@@ -221,7 +211,7 @@ def _grid(
         return figure.add_axes(room, label=label)
 
     def place(row: int, load: int) -> tuple[float, float]:
-        column, line = (row % across, load * folds + row // across) if upright else (load, row)
+        column, line = (row, load) if upright else (load, row)
         return left + column * (width + GAP), below + (lines - 1 - line) * step
 
     axes = [[add(*place(row, load), width, height) for load in range(loads)] for row in range(rows)]

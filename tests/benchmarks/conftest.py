@@ -4,9 +4,6 @@ import shutil
 
 import pytest
 
-from benchmarks import pareto
-from dpl.evaluation.tables import write
-
 
 @pytest.fixture(scope="session")
 def home(tmp_path_factory):
@@ -18,9 +15,9 @@ def home(tmp_path_factory):
 def trained(script, tiny_training, home):
     """A folder with runs/tiny and runs/other, in each a run of the paper's network and `unrolled`.
 
-    Runs, data and `meshes.csv` are written once; tests write elsewhere.
+    Runs and data are written once; tests write elsewhere.
     """
-    if not (home / "meshes.csv").exists():
+    if not (home / "runs/other").exists():
         shared = [one for one in tiny_training if not one.startswith("model.")]
         models = {"fcnn": ["model=fcnn", "model.width=16"], "unrolled": ["model=unrolled"]}
         for name, more in models.items():
@@ -28,5 +25,4 @@ def trained(script, tiny_training, home):
             ended = script("train", *shared, *common, *more, cwd=home)
             assert ended.status == 0, ended.err
         shutil.copytree(home / "runs/tiny", home / "runs/other")
-        write([pareto.Discretisation((4, 1, 1), 1, 135, 3.0, -18.8, 0.34)], home / "meshes.csv")
     return home

@@ -39,22 +39,6 @@ def test_a_stress_that_is_left_out_has_zero_maps(build, sets, left_out):
         assert by_stress[:, ablation.STRESSES[kept]].abs().max() > 0
 
 
-def test_the_quadratic_first_feature_changes_the_first_map_alone(build, sets):
-    variant = next(one for one in ablation.variants({}) if "first map" in one.name)
-    row, net = fitted(variant, build, sets)
-    other, whole = fitted(ablation.WHOLE, build, sets)
-    assert torch.equal(net.modes, whole.modes)
-    assert not torch.equal(net.first_map, whole.first_map)
-    assert row.e_mean != other.e_mean
-    assert fitted(ablation.WHOLE, build, sets)[0].e_mean == other.e_mean
-
-
-def test_without_rounding_the_modes_are_float64(build, sets):
-    variant = next(one for one in ablation.variants({}) if "float64" in one.name)
-    assert fitted(variant, build, sets)[1].modes.dtype == torch.float64
-    assert fitted(ablation.WHOLE, build, sets)[1].modes.dtype == torch.float32
-
-
 def test_errors_are_those_of_the_predictions_and_of_a_newton_step(build, sets, monkeypatch):
     monkeypatch.setattr(Unrolled, "_is_compiled", lambda *_: False)  # as in an ablation
     row, net = fitted(ablation.Variant("", {"rank": 40, "stages": 0}), build, sets)

@@ -1,13 +1,11 @@
 """Laws of learning curves."""
 
-import csv
-
 import pytest
-from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
 from benchmarks import learning_curves
 from benchmarks.learning_curves import ERROR, Validation
+from benchmarks.study import read
 
 
 def write_events(folder, errors, steps=10):
@@ -54,7 +52,7 @@ def test_rows_and_a_picture_are_written(tmp_path):
     write_events(tmp_path / "pod", {0: 0.05, 9: 0.004})
     runs = [tmp_path / "fcnn", tmp_path / "pod"]
     assert learning_curves.save(runs, tmp_path / "curves")
-    rows = list(csv.DictReader((tmp_path / "curves.csv").open()))
-    assert [row["method"] for row in rows] == ["fcnn", "fcnn", "pod", "pod"]
-    assert float(rows[-1]["rel_L2_median"]) == pytest.approx(0.004)
-    assert Image.open(tmp_path / "curves.png").size == (1120, 680)
+    rows = read(Validation, tmp_path / "curves.csv")
+    assert [row.method for row in rows] == ["fcnn", "fcnn", "pod", "pod"]
+    assert rows[-1].rel_L2_median == pytest.approx(0.004)
+    assert (tmp_path / "curves.png").is_file()

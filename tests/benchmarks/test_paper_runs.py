@@ -13,21 +13,10 @@ import yaml
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from benchmarks import (
-    all_results,
-    loss_table,
-    paper_runs,
-    paper_tables,
-    run_estimates,
-    subcommands,
-)
-from benchmarks.loss_table import LossRow
-from benchmarks.paper_runs import Run, RunTime, Session, State
-from benchmarks.paper_tables import Result
-from benchmarks.tables import read
+from benchmarks import all_results, loss_table, paper_runs, subcommands
+from benchmarks.paper_runs import Run, State
 from dpl.commands import dry_run
 from dpl.config import CONF
-from dpl.evaluation.tables import write
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = OmegaConf.to_container(OmegaConf.load(ROOT / "benchmarks/conf/paper.yaml"))
@@ -51,25 +40,6 @@ def planned(groups=None, more=()):
 
 
 # ------------------------------------------------------------------ the plan
-
-
-def test_expected_times_are_those_of_the_published_tables(tmp_path):
-    def rows(minutes, generation):
-        times = {"generation_minutes": generation, "training_minutes": minutes}
-        return [Result("linear", "in range", 1), Result("fcnn", "in range", 1, 1, **times)]
-
-    write(rows(10.0, 6.0), tmp_path / "beam_svk.csv")
-    write(rows(20.0, 7.0), tmp_path / "propeller_nh.csv")
-    write([LossRow("fcnn-mse", 2, *[0.0] * 7, 3.0)], tmp_path / "losses.csv")
-    runs = [*planned().values(), Run("one", "beam_nh_loss/fcnn", ())]
-    assert run_estimates.expected_minutes(runs, tmp_path) == {
-        "beam_svk/fcnn": 10,
-        "propeller_nh/fcnn": 20,
-        "beam_nh_loss/fcnn": 15,  # the mean of those of the other experiments
-        "losses/fcnn-mse-0": 3,
-        "losses/fcnn-mse-1": 3,
-    }
-    assert run_estimates.data_minutes(runs, tmp_path) == 6 + 7
 
 
 def test_each_run_is_planned_for_each_experiment_and_value():
@@ -98,6 +68,16 @@ def test_sizes_of_a_run_replace_those_of_its_experiment():
     runs = {run.path: run.options for run in paper_runs.planned(PLAN, ["one"], sizes)}
     assert "mesh.nodes=[6,3,3]" in runs["beam_svk/fcnn"]
     assert "mesh.nodes=[5,3,3]" in runs["beam_svk/pod"]
+
+
+def test_a_run_is_repeated_in_folders_with_their_options():
+    plan = {"a": PLAN["one"] | {"folders": {"x": ["loads=x"], "y": ["trainer.max_epochs=2"]}}}
+    runs = {run.path: run.options for run in paper_runs.planned(plan, None, {})}
+    assert [path for path in runs if path.startswith("beam_svk/")] == [
+        *("beam_svk/x/fcnn", "beam_svk/x/pod", "beam_svk/y/fcnn", "beam_svk/y/pod"),
+    ]
+    assert "loads=x" in runs["beam_svk/x/fcnn"]
+    assert "trainer.max_epochs=2" in runs["beam_svk/y/fcnn"]
 
 
 def test_an_unknown_group_and_a_path_of_two_runs_are_refused():
@@ -178,16 +158,18 @@ def begin(folder, target="dpl.models.FCNN", **files):
         (folder / name).write_text("[]")
 
 
-def test_states_follow_from_the_folder_and_the_journal(run, tmp_path):
-    assert paper_runs.state(run, tmp_path, []) == State.MISSING
-    begin(tmp_path / run.path)
-    assert paper_runs.state(run, tmp_path, []) == State.INTERRUPTED
-    (tmp_path / run.path / "evaluation.json").write_text("[]")
-    assert paper_runs.state(run, tmp_path, []) == State.FINISHED, "trained by hand"
-    same = Session(run.path, run.options, "finished", 1.0, 2)
-    other = Session(run.path, ("model=cnn",), "finished", 1.0, 2)
-    assert paper_runs.state(run, tmp_path, [other, same]) == State.FINISHED
-    assert paper_runs.state(run, tmp_path, [same, other]) == State.OTHER_OPTIONS
+def test_states_follow_from_the_folder_of_a_run(run, tmp_path):
+    folder = tmp_path / run.path
+    paper_runs.keep_options(run, tmp_path)
+    assert paper_runs.state(run, tmp_path) == State.MISSING
+    begin(folder)
+    assert paper_runs.state(run, tmp_path) == State.INTERRUPTED
+    (folder / "evaluation.json").write_text("[]")
+    assert paper_runs.state(run, tmp_path) == State.FINISHED, "trained by hand"
+    paper_runs.keep_options(run, tmp_path)
+    assert paper_runs.state(run, tmp_path) == State.FINISHED
+    other = Run("one", run.path, ("model=cnn",))
+    assert paper_runs.state(other, tmp_path) == State.OTHER_OPTIONS
 
 
 def test_trainings_are_resumed_and_fitted_models_are_evaluated(run, tmp_path):
@@ -205,34 +187,6 @@ def test_trainings_are_resumed_and_fitted_models_are_evaluated(run, tmp_path):
         "evaluate",
         [f"run={tmp_path / fitted.path}"],
     )
-
-
-def test_the_journal_keeps_sessions_and_survives_a_torn_line(run, tmp_path):
-    sessions = [
-        Session(run.path, run.options, end, seconds, 2)
-        for end, seconds in (("interrupted", 60.0), ("finished", 120.0))
-    ]
-    for session in sessions:
-        paper_runs.append(session, tmp_path)
-    with (tmp_path / paper_runs.JOURNAL).open("a") as file:
-        file.write('{"run": "beam_svk/fc')
-    assert paper_runs.read_journal(tmp_path) == sessions
-
-
-def test_times_are_sums_over_sessions_with_the_same_options(run, tmp_path):
-    sessions = [
-        Session(run.path, ("model=cnn",), "finished", 600.0, 2),
-        Session(run.path, run.options, "interrupted", 60.0, 2),
-        Session(run.path, run.options, "finished", 120.0, 2),
-    ]
-    (tmp_path / run.path).mkdir(parents=True)
-    (tmp_path / run.path / "training.jsonl").write_text('{"seconds": 90.0}\n')
-    other = Run("one", "beam_svk/pod", ("experiment=paper",))
-    row, total = paper_runs.times([run, other], tmp_path, sessions)
-    assert (row.sessions, row.end, row.minutes, row.training_minutes) == (2, "finished", 3.0, 1.5)
-    assert (total.run, total.minutes, total.end) == ("total", 3.0, "interrupted")
-    assert paper_runs.times([run], tmp_path, sessions)[-1].end == "finished"
-    assert paper_runs.times([other], tmp_path, sessions) == []
 
 
 # ------------------------------------------------------------------ processes
@@ -315,21 +269,6 @@ def test_numbers_of_a_run_are_those_of_its_evaluation(tmp_path):
     assert found[6] == 5.5
 
 
-def test_methods_stand_beside_the_papers_network():
-    rows = [
-        *paper_tables.paper("beam_svk"),
-        paper_tables.Result("pod", "in range", 100, 4095, e_mean=4e-6),
-        paper_tables.Result("pod", "twice", 100, 4095, e_mean=1.0),
-    ]
-    (row,) = all_results.beside_the_paper("beam_svk", rows)
-    assert (row.method, row.paper_e_mean, row.paper_SNR_min) == ("pod", 8e-6, 8.4)
-    assert row.ratio == pytest.approx(0.5)
-    (wide,) = all_results.beside_the_paper("beam_young_wide", rows[1:])
-    assert (wide.paper_e_mean, wide.paper_e_max) == (1e-4, None)
-    (own,) = all_results.beside_the_paper("mine", rows[1:])
-    assert (own.paper_e_mean, own.ratio) == (None, None)
-
-
 # ------------------------------------------------------------------ the commands
 
 
@@ -343,25 +282,10 @@ def test_the_plan_is_printed_and_nothing_is_started(script, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["groups=[two]"], "plan: groups = 'two' must be one of networks"),
-        (["scale=tiny"], "scale = tiny must be one of full, small"),
-        (["rums=there"], "rums"),
-    ],
-)
-def test_wrong_options_end_with_one_line(script, tmp_path, options, said):
-    ended = script("paper", *options, cwd=tmp_path)
-    assert ended.status == 2
-    assert said in ended.err
-    assert "Traceback" not in ended.err
-
-
 def test_a_run_of_other_options_is_refused_before_anything_starts(script, tmp_path):
     begin(tmp_path / "runs/small/beam_nh_loss/fcnn_full_mse")
-    other = Session("beam_nh_loss/fcnn_full_mse", ("model=cnn",), "finished", 1.0, 2)
-    paper_runs.append(other, tmp_path / "runs/small")
+    other = Run("full", "beam_nh_loss/fcnn_full_mse", ("model=cnn",))
+    paper_runs.keep_options(other, tmp_path / "runs/small")
     ended = script("paper", "scale=small", "groups=[full]", cwd=tmp_path)
     assert ended.status == 2
     assert "runs/small/beam_nh_loss/fcnn_full_mse was trained with other options" in ended.err
@@ -397,27 +321,16 @@ def test_one_command_trains_resumes_and_writes_all_tables(start, tmp_path):
     first.send_signal(signal.SIGINT)
     _, err = first.communicate(timeout=300)
     assert first.returncode == 130, err[-2000:]
-    assert [one.end for one in paper_runs.read_journal(root)] == ["interrupted"]
     second = start("paper", *TINY, cwd=tmp_path)
     out, err = second.communicate(timeout=600)
     assert second.returncode == 0, (out + err)[-3000:]
-    ends = [one.end for one in paper_runs.read_journal(root)]
-    assert ends == ["interrupted", "finished", "finished", "finished"]
-    *rows, total = read(RunTime, root / "paper_times.csv")
-    assert [row.sessions for row in rows] == [2, 1, 1]
-    assert (total.run, total.end) == ("total", "finished")
-    assert total.minutes == pytest.approx(sum(row.minutes for row in rows), rel=1e-3)
     results = root / "results"
     assert {path.stem for path in results.glob("*.csv")} == {
-        *("beam_svk", "hybrid_newton", "losses", "paper"),
+        *("beam_svk", "hybrid_newton", "losses"),
     }
     assert {path.stem for path in results.glob("*.png")} == {"beam_svk", "hybrid_newton"}
-    compared = {row.method: row for row in read(all_results.Comparison, results / "paper.csv")}
-    assert {"linear", "unrolled", "fcnn"} <= set(compared)
-    assert compared["unrolled"].paper_e_mean == 8e-6
     assert "left out: propeller_nh: no finished run" in out
     third = start("paper", *TINY, "tables=false", cwd=tmp_path)
     out, _ = third.communicate(timeout=120)
     assert third.returncode == 0
     assert "3 finished" in out
-    assert len(paper_runs.read_journal(root)) == 4

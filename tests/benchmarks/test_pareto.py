@@ -1,6 +1,5 @@
 """Run time against error: every iterate has a time and an error."""
 
-import csv
 import itertools
 
 import pytest
@@ -8,7 +7,6 @@ import torch
 
 from benchmarks import pareto
 from dpl import Sample
-from dpl.evaluation.tables import write
 from dpl.fem import solve
 from dpl.inference import Direct, Hybrid
 
@@ -71,51 +69,3 @@ def test_the_number_of_threads_is_set_and_restored(solvers, batch):
     assert set(seen) == {2}
     assert row.threads == 2
     assert torch.get_num_threads() == before
-
-
-def test_the_figure_and_the_rows_are_written(rows, tmp_path):
-    others = [pareto.Discretisation((4, 1, 1), 1, 60, 3.0, -18.8, 0.34)]
-    write(rows, tmp_path / "a.csv")
-    pareto.draw(rows, others, 0.01, tmp_path / "a.png")
-    pareto.draw(rows, [], None, tmp_path / "b.png")
-    sizes = [(tmp_path / name).stat().st_size for name in ("a.png", "b.png")]
-    assert sizes[0] > sizes[1] > 10_000
-    written = list(csv.DictReader((tmp_path / "a.csv").open()))
-    assert [row["solver"] for row in written] == [row.solver for row in rows]
-
-
-def test_a_law_with_a_range_is_measured_without_pod_galerkin(script, tiny_training, tmp_path):
-    kept = [one for one in tiny_training if not one.startswith(("model.", "data.train"))]
-    law = ["model=unrolled", "material.poisson=[0.2,0.4]", "data.train=40", "run=runs/e/a"]
-    ended = script("train", *kept, *law, cwd=tmp_path)
-    assert ended.status == 0, ended.err[-2000:]
-    refused = script("pareto", "run=runs/e", cwd=tmp_path)
-    assert refused.status == 2
-    assert refused.err.startswith("error: galerkin: poisson = [0.2, 0.4] must be one number")
-    assert refused.err.count("\n") == 1
-    ended = script("pareto", "run=runs/e", "galerkin=null", cwd=tmp_path)
-    assert ended.status == 0, ended.err[-2000:]
-    path = tmp_path / "runs" / "pareto" / "pareto_e.csv"
-    error = {row["solver"]: float(row["error"]) for row in csv.DictReader(path.open())}
-    assert error["a, corrected"] < error["a"] < error["linear"]
-
-
-def test_reduced_models_of_a_run_on_a_stream_are_made_from_its_validation_loads(
-    script, tiny_training, tmp_path
-):
-    kept = [one for one in tiny_training if not one.startswith("data.train")]
-    stream = [
-        "data=online",
-        "data.train.batches=1",
-        "data.train.capacity=8",
-        "trainer.max_epochs=1",
-    ]
-    ended = script("train", *stream, *kept, "run=runs/e/a", cwd=tmp_path)
-    assert ended.status == 0, ended.err[-2000:]
-    ended = script("pareto", "run=runs/e", "galerkin.rank=4", cwd=tmp_path)
-    assert ended.status == 0, ended.err[-2000:]
-    path = tmp_path / "runs" / "pareto" / "pareto_e.csv"
-    assert "POD-Galerkin" in {row["solver"] for row in csv.DictReader(path.open())}
-    refused = script("pareto", "run=runs/e", "galerkin.rank=5", cwd=tmp_path)
-    assert refused.status == 2
-    assert "galerkin: rank = 5 must lie between 1 and 4, " in refused.err

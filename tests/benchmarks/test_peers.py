@@ -7,8 +7,8 @@ import textwrap
 import pytest
 
 from benchmarks import blas_detection, peers
-from benchmarks.tables import read
-from dpl.fem import solve
+from benchmarks.study import read
+from dpl.fem import Newton, solve
 
 
 def test_cases_are_the_fields_scenes():
@@ -23,7 +23,7 @@ def test_cases_are_the_fields_scenes():
 def test_answer_of_a_case_is_the_one_that_the_codes_agree_on(name):
     case = peers.CASES[name]
     problem, load = case.build()
-    answer = solve(peers.Newton(problem), load)
+    answer = solve(Newton(problem), load)
     assert case.error(problem, answer) < 1e-8
 
 
@@ -118,14 +118,11 @@ def test_peer_with_another_answer_is_not_timed(peer, off):
         peers.time_reference_code(sys.executable, peer(off), 1)
 
 
-@pytest.mark.parametrize(
-    ("end", "reason"),
-    [("raise SystemExit('no such library')", "no such library"), ("sys.exit(3)", "exit status 3")],
-)
-def test_peer_that_fails_says_why(tmp_path, end, reason):
+@pytest.mark.parametrize("end", ["SystemExit('no such library')", "SystemExit(3)"])
+def test_peer_that_fails_says_why(tmp_path, end):
     program = tmp_path / "broken_beam.py"
-    program.write_text(f"import sys\n{end}\n")
-    with pytest.raises(OSError, match=reason):
+    program.write_text(f"raise {end}\n")
+    with pytest.raises(OSError, match=r"no such library|exit status 3"):
         peers.time_reference_code(sys.executable, program, 1)
 
 

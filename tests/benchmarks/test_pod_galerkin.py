@@ -100,3 +100,10 @@ def test_huge_load_ends_as_a_value(solver, snapshots, unseen):
     assert lost.displacement.isfinite().all()
     assert lost.load_factor < 1
     assert lost.residual > TOL
+
+
+def test_a_body_with_a_range_is_refused(solver, snapshots):
+    mesh, law = fem.box([4.0, 1.0, 1.0], [9, 3, 3]), fem.NeoHookeanLn([0.2, 0.4])
+    ranged = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"))
+    with pytest.raises(ValueError, match=r"poisson = \[0\.2, 0\.4\] must be one number"):
+        PODGalerkin.fit(ranged, snapshots, 6, tolerance=1e-2, lift=solver.linear_solver)

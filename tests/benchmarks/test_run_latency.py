@@ -6,7 +6,6 @@ import torch
 from benchmarks import run_latency
 from dpl.inference import Simulator
 from dpl.models import FCNN
-from dpl.system.threads import available_cores
 from dpl.training import MSE, Surrogate
 
 
@@ -41,14 +40,6 @@ def test_every_call_is_timed_with_every_load(simulator, batch, monkeypatch):
     assert min(given.count(tol) for tol in (None, 1e-3, 1e-6)) >= 12
 
 
-def test_calls_to_tolerances_alternate_with_newton(simulator, batch):
-    rows = list(run_latency.against_newton("mine", simulator, batch.load, repeats=1))
-    assert [row.tol for row in rows] == [1e-3, 1e-6]
-    assert {row.loads for row in rows} == {12}
-    assert all(0 < row.p50 <= row.p99 and 0 < row.newton_p50 <= row.newton_p99 for row in rows)
-    assert all(row.methods == "full Newton 12" for row in rows), "an untrained network is far off"
-
-
 def test_loads_are_listed_by_their_number_of_steps(simulator, batch, monkeypatch):
     call = Simulator.__call__
 
@@ -62,21 +53,3 @@ def test_loads_are_listed_by_their_number_of_steps(simulator, batch, monkeypatch
     rows = {row.call: row.loads for row in run_latency.call_times(simulator, batch.load)}
     assert rows["  steps in the modes: 0"] == rows["  steps in the modes: 1"] == 6
     assert rows["sim(force)"] == 12
-
-
-def test_batches_are_predicted_whole_on_one_thread_and_on_all_cores(simulator, monkeypatch):
-    seen = []
-    predict = Surrogate.predict
-
-    def listen(self, load):
-        seen.append((torch.get_num_threads(), len(load.force)))
-        return predict(self, load)
-
-    monkeypatch.setattr(Surrogate, "predict", listen)
-    before = torch.get_num_threads()
-    rates = list(run_latency.throughputs(simulator, batches=(1, 3), repeats=2))
-    pairs = [(threads, size) for threads in sorted({1, available_cores()}) for size in (1, 3)]
-    assert seen == [pair for pair in pairs for _ in range(3)]
-    assert [(rate.threads, rate.batch) for rate in rates] == pairs
-    assert all(rate.loads_per_second > 0 for rate in rates)
-    assert torch.get_num_threads() == before

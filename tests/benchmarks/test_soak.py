@@ -57,13 +57,11 @@ def test_processes_files_and_memory_of_children_count():
     assert soak.leftovers(before, after) == []
 
 
-def test_every_kind_of_call_is_made(scene, tmp_path):
+def test_every_kind_of_call_is_made(scene):
     sim = Simulator(Surrogate(FCNN(scene, width=8), MSE(), scene))
     rows = list(soak.simulator(sim, 1.5, every=0.05))
     assert rows[-1].steps > 7, "every kind of call was made"
     assert [row.seconds for row in rows] == sorted(row.seconds for row in rows)
-    soak.draw(rows, tmp_path / "soak.png")
-    assert (tmp_path / "soak.png").stat().st_size > 10_000
     assert soak.summary(rows).startswith("simulator: ")
 
 
@@ -72,6 +70,6 @@ def test_a_short_soak_leaves_its_rows_and_figure(script, tiny, tmp_path):
     options = ["data.val=4", "data.test=4", "data.batch_size=8", "model.width=16", "minutes=0.5"]
     ended = script("soak", *tiny, *options, "run=r", cwd=tmp_path)
     assert ended.status in (0, 1), ended.err
-    assert {"soak.csv", "soak.png", "machine.json"} <= {p.name for p in (tmp_path / "r").iterdir()}
+    assert {"soak.csv", "soak.png", "soak.json"} <= {p.name for p in (tmp_path / "r").iterdir()}
     assert "online training: " in ended.out
     assert "more than before" not in ended.out

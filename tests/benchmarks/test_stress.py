@@ -3,19 +3,12 @@
 import csv
 from dataclasses import replace
 from decimal import Decimal
-from types import SimpleNamespace
 
 import pytest
-import torch
 
 from benchmarks import stress
 from benchmarks.stress import Case, Verdict, run_case, select_cases
-from benchmarks.stress.auditor import Auditor
 from benchmarks.stress.case import classify
-from benchmarks.stress.trained_run import AmplitudeSweep, cases, hybrid, newton, simulator_answers
-from dpl.fem import solve
-from dpl.models import FCNN
-from dpl.training import MSE, Surrogate
 
 ROUNDED = ("T1", "T3", "T4", "T8", "T10")  # their references are rounded: the last digit is right
 
@@ -95,16 +88,6 @@ def test_two_cases_from_the_command_line(script, tmp_path):
     assert all(row["holds"] == "True" for row in comparisons)
 
 
-def test_load_sweeps_are_drawn(script, tmp_path, monkeypatch):
-    whole = select_cases(["sweep"])
-    (case,) = [c for c in whole if "triangle of degree 1" in c.description]
-    monkeypatch.setattr(stress, "select_cases", lambda wanted: [case])
-    ended = script("stress", "folder=out", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    assert (tmp_path / "out/load_sweeps.png").stat().st_size > 5000
-    assert len(table(tmp_path / "out/load_sweeps.csv")) == len(stress.loads.AMPLITUDES)
-
-
 @pytest.mark.parametrize(
     ("outcome", "status"),
     [
@@ -137,69 +120,3 @@ def test_rows_are_there_before_the_next_case_begins(script, tmp_path, monkeypatc
     ended = script("stress", cwd=tmp_path)
     assert ended.status == 130
     assert [row["description"] for row in table(tmp_path / "runs/stress/cases.csv")] == ["done"]
-
-
-def test_unknown_cases_and_runs_are_refused_with_one_line(script, tmp_path):
-    for argument, words in (("cases=[T99]", "cases: 'T99'"), ("run=runs/none", "run = runs/none")):
-        ended = script("stress", argument, cwd=tmp_path)
-        assert ended.status == 2
-        assert ended.err.startswith(f"error: {words}")
-
-
-# ------------------------------------------------------------------ a surrogate
-
-
-@pytest.fixture(scope="module")
-def sweep(scene) -> AmplitudeSweep:
-    """A load sweep for an untrained network."""
-    torch.manual_seed(0)
-    surrogate = Surrogate(FCNN(scene, width=8), MSE(), scene)
-    return AmplitudeSweep(surrogate.eval(), 1, (1e-9, 1e-3, 1.0, 2.0, 10.0))
-
-
-def test_loads_of_a_sweep_have_their_amplitudes(sweep, scene):
-    for step in sweep.steps:
-        amplitude, _ = scene.loads.project(step.load.force)
-        assert amplitude.item() == pytest.approx(step.amplitude, rel=1e-6)
-
-
-def test_an_untrained_surrogate_reports_estimates(sweep):
-    auditor = Auditor()
-    alone, exact = simulator_answers(sweep, None, auditor), simulator_answers(sweep, 1e-6, auditor)
-    assert alone.verdict == Verdict.EXPECTED, alone.observed
-    assert exact.verdict == Verdict.EXPECTED, exact.observed
-    status = alone.levels[2].status
-    assert "(estimated)" in status or "unknown" in status
-    assert "out of range by 9 times the training's largest" in alone.levels[-1].status
-    assert alone.levels[2].error > 0.1 > 1e-4 > exact.levels[2].error
-    for kind in (hybrid, newton):
-        outcome = kind(sweep, auditor)
-        assert outcome.verdict == Verdict.EXPECTED, outcome.observed
-    assert auditor.violations == []
-    assert auditor.solves == 2 * len(sweep.steps)
-
-
-FALSE_STATEMENTS = {
-    "it converged": {"converged": True},
-    "its residual": {"residual": 1e-9},
-    "nothing is inverted": {"volume_ratio": -1.0},
-    "its summary": {"summary": "residual 1e-9 of the load (converged)"},
-    "it is in range": {"out_of_distribution": False},
-}
-
-
-@pytest.mark.parametrize("violation", FALSE_STATEMENTS)
-def test_a_false_statement_of_a_simulator_is_silently_wrong(sweep, violation):
-    real = sweep.ask
-
-    def ask(step, tol):
-        return replace(real(step, tol), **FALSE_STATEMENTS[violation])
-
-    simulator = SimpleNamespace(steps=sweep.steps, scene=sweep.scene, ask=ask)
-    assert simulator_answers(simulator, None, Auditor()).verdict == Verdict.WRONG
-
-
-def test_a_surrogate_has_four_cases(sweep):
-    found = cases(sweep.surrogate, count=1)
-    assert [case.name for case in found] == ["run"] * 4
-    assert solve(sweep.scene.solver, sweep.steps[0].load).converged.all()

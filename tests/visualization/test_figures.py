@@ -132,8 +132,6 @@ def test_a_prediction_lies_within_its_panel_in_the_colours_of_its_error(scene, b
         assert low <= flat[:, 1].min() < flat[:, 1].max() <= high
     assert not np.ptp(faces(figure.axes[2]), axis=0).any(), "all polygons have the same colour"
     assert figure.axes[-1].get_yscale() == "linear", "errors of similar size"
-    logarithmic = plot_deformed(scene.problem, truth, shown[2:], logarithmic=True)
-    assert logarithmic.axes[-1].get_yscale() == "log"
 
 
 def test_a_prediction_that_is_not_finite_is_left_out(scene, batch):
@@ -170,21 +168,6 @@ def test_upright_figures_have_one_row_per_load(make_scene):
     assert heights["a"] > heights["b"] > heights["c"]
     places = {ax.get_xlabel(): ax.get_position().x0 for ax in panels(figure)}
     assert places["finite elements"] < places["network"] < places["linear"]
-
-
-def test_many_predictions_of_one_load_continue_in_a_second_line(scene, batch):
-    truth = batch.displacement[:1]
-    shown = [(f"network {k}", (1 + 0.1 * k) * truth) for k in range(5)]
-    figure = plot_deformed(scene.problem, truth, shown, upright=True)
-    figure.draw_without_rendering()
-    places = [ax.get_position() for ax in panels(figure)]
-    assert len({round(place.y0, 6) for place in places[:4]}) == 1
-    assert all(place.y1 < places[0].y0 for place in places[4:])
-    assert places[4].x0 == pytest.approx(places[0].x0)
-    texts = [text for ax in figure.axes for text in (ax.xaxis.label, ax.yaxis.label)]
-    boxes = [text.get_window_extent() for text in texts if text.get_text()]
-    assert len(boxes) == 6 + 5
-    assert all(sum(box.overlaps(other) for other in boxes) == 1 for box in boxes)
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])

@@ -1,0 +1,235 @@
+"""Rows of the studies: their loads are what their names say, their errors those of the answers."""
+
+import itertools
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import deflections, discretisation, local_loads, peers, single_loads, transfer
+from benchmarks import sizes as beams
+from benchmarks.paper_tables import PAPER
+from benchmarks.study import METHOD_COLOURS, OTHER_COLOURS, method_colours
+from dpl import Sample
+from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, solve
+from dpl.models import Unrolled
+from dpl.training import MSE, ErrorMetrics, Surrogate
+
+
+@pytest.fixture(scope="module")
+def rows(scene):
+    return deflections.deflections({"a": scene, "b": scene}, 4, 0)
+
+
+def test_deflections_are_those_of_the_test_loads_of_a_data_set(rows, data):
+    truth = data.samples("test").displacement.norm(dim=2).amax(dim=1)
+    for body in ("a", "b"):
+        mine = [row for row in rows if row.body == body]
+        assert [row.load for row in mine] == [0, 1, 2, 3]
+        assert [row.deflection for row in mine] == pytest.approx(truth.tolist(), rel=1e-6)
+    assert {body: len(values) for body, values in deflections.by_body(rows).items()} == {
+        "a": 4,
+        "b": 4,
+    }
+
+
+def test_loads_that_are_not_accepted_are_left_out(scene, monkeypatch):
+    def answered(scene, jobs, *, workers):
+        for outcome in peers.solve_loads(scene, jobs, workers=workers):
+            yield outcome._replace(accepted=outcome.job.number != 1)
+
+    monkeypatch.setattr(deflections, "solve_loads", answered)
+    found = deflections.deflections({"a": scene}, 3, 0)
+    assert [row.load for row in found] == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("experiment", "build"),
+    [
+        ("beam_svk", lambda: peers.beam_scene(SaintVenantKirchhoff(0.3))),
+        ("propeller_nh", peers.propeller_scene),
+    ],
+)
+def test_bodies_are_those_of_the_experiments(scene_of, experiment, build):
+    theirs, ours = scene_of(f"experiment={experiment}"), build()
+    loads = [scene.loads.sample((0, 2), range(2)).force for scene in (theirs, ours)]
+    assert theirs.problem.length == ours.problem.length
+    assert torch.allclose(*loads, rtol=1e-9, atol=1e-12 * float(loads[0].abs().max()))
+
+
+@pytest.fixture(scope="module")
+def chosen(batch):
+    return single_loads.choose(batch, 0.1)
+
+
+def test_the_load_is_that_with_the_nearest_deflection(batch):
+    largest = single_loads.largest_displacements(batch)
+    for k, deflection in enumerate(largest.tolist()):
+        assert single_loads.choose(batch, deflection * (1 + 1e-9)) == k
+    assert single_loads.choose(batch, 1e3) == int(largest.argmax())
+
+
+def test_an_error_of_one_percent_has_40_db(scene, batch, chosen):
+    """With u = 1.01 v, relative L2 is 0.01, e_max is 0.01 max |v| and the SNR is 20 log10(101)."""
+    exact = batch.displacement[chosen]
+    (row,) = single_loads.measure({"near": lambda load: 1.01 * exact[None]}, batch, chosen)
+    assert (row.method, row.load) == ("near", chosen)
+    assert row.rel_L2 == pytest.approx(0.01)
+    assert row.e_max == pytest.approx(0.01 * row.deflection)
+    assert pytest.approx(40.0864, abs=1e-3) == row.SNR
+    metrics = ErrorMetrics(scene.problem)
+    metrics.update(1.01 * exact[None], Sample(*(column[chosen : chosen + 1] for column in batch)))
+    expected = {name: float(value) for name, value in metrics.compute().items()}
+    assert row.e_mean == pytest.approx(expected["e_mean"])
+    assert row.e_max == pytest.approx(expected["e_max"])
+
+
+def test_the_paper_s_single_loads_are_named():
+    assert set(single_loads.PAPER) < set(PAPER)
+    rows = single_loads.paper("beam_svk")
+    assert [row.load for row in rows] == [None, None]
+    assert rows[1].rel_L2 == pytest.approx(0.0098, abs=1e-4), "40.2 dB"
+    assert single_loads.paper("mine") == []
+
+
+@pytest.fixture(scope="module")
+def surrogate(scene):
+    load = scene.loads.sample(0, range(20))
+    states = solve(scene.solver, load).displacement
+    samples = Sample(load.force, states, load.young, load.parameters)
+    net = Unrolled(scene, rank=20, cells=8, stages=1)
+    net.fit(samples, samples)
+    return Surrogate(net, MSE(), scene).eval()
+
+
+def test_point_forces_act_on_one_node_and_patches_on_few(scene):
+    kinds = list(local_loads.kinds(scene, 5))
+    assert [name for name, *_ in kinds] == [local_loads.RUN, *2 * list(local_loads.FAMILIES)]
+    for name, _, load in kinds[1:]:
+        nodes = load.force.any(dim=2).sum(dim=1)
+        assert (nodes == 1).all() if name == "point force" else (nodes <= 9).all()
+
+
+def test_the_rows_have_the_errors_of_the_surrogate(surrogate, monkeypatch):
+    monkeypatch.setattr(local_loads, "missing_packages", lambda: ["onnx"])
+    rows = list(local_loads.measure(surrogate, 4))
+    assert all(row.count == 4 and row.onnx_p50 is None for row in rows)
+    assert all(0 < row.linear_p50 <= row.linear_p99 < 1e-5 for row in rows)
+    scene = surrogate.scene
+    load = scene.loads.sample(local_loads.STREAM, range(4))
+    exact = solve(scene.newton, load).displacement
+    with torch.no_grad():
+        wrong = (surrogate.predict(load) - exact).flatten(1).norm(dim=1)
+        errors = wrong / exact.flatten(1).norm(dim=1)
+    assert rows[0].error_p50 == pytest.approx(float(errors.quantile(0.5)), rel=1e-4)
+    small = [row for row in rows if row.deflection == min(local_loads.DEFLECTIONS)]
+    assert all(row.error_p99 < 1e-2 for row in small)
+
+
+@pytest.fixture(scope="module")
+def tests_of(scene):
+    """Loads of two families: those of the scene, and the same at a tenth of their size."""
+    load = scene.loads.sample((0, 9), range(4))
+    sets = {}
+    for name, factor in {"modal": 1.0, "small": 0.1}.items():
+        force = factor * load.force
+        solution = solve(scene.solver, load._replace(force=force))
+        sets[name] = Sample(force, solution.displacement, load.young, load.parameters)
+    return sets
+
+
+def test_a_row_has_the_errors_of_predictions_and_the_solves_from_them(scene, tests_of):
+    def predict(load):
+        return 1.01 * solve(scene.solver, load).displacement
+
+    newton = {name: transfer.newton_iterations(scene, test) for name, test in tests_of.items()}
+    rows = list(transfer.measure("near", "modal", predict, scene, tests_of, newton))
+    assert [(row.network, row.trained_on, row.tested_on) for row in rows] == [
+        ("near", "modal", "modal"),
+        ("near", "modal", "small"),
+    ]
+    for row in rows:
+        assert row.count == 4
+        assert row.rel_L2_median == pytest.approx(0.01, rel=1e-4)
+        assert row.rel_L2_worst == pytest.approx(0.01, rel=1e-4)
+        assert pytest.approx(40.0864, abs=1e-2) == row.SNR_min
+        assert row.converged == 100
+    assert rows[0].newton_iterations > rows[1].newton_iterations, "small loads are nearly linear"
+
+
+def test_the_file_of_fingertips_is_what_its_program_writes(tmp_path, monkeypatch):
+    folder, copy = Path(transfer.__file__).parent / "loads", tmp_path / "forces.npz"
+    monkeypatch.setattr(sys, "argv", ["fingertips", str(copy)])
+    runpy.run_path(str(folder / "fingertips.py"), run_name="__main__")
+    forces, stored = (np.load(path)["forces"] for path in (copy, folder / "fingertips.npz"))
+    np.testing.assert_allclose(forces, stored, rtol=1e-5)
+    assert forces.shape == (32, 4000, 3)
+    assert forces.any(axis=(1, 2)).all()
+
+
+def test_scenes_of_another_body_are_named(scene, make_scene):
+    assert transfer.differences({"a": scene, "b": scene}) == []
+    lines = transfer.differences({"a": scene, "b": make_scene(cell="tetra")})
+    assert lines
+    assert all(line.startswith("b and a: ") for line in lines)
+
+
+def test_values_on_meshes_twice_as_fine_tend_to_the_limit():
+    values = [3.0 + 0.5 * 4.0**-k for k in range(3)]
+    assert discretisation.limit(*values) == pytest.approx(3.0, rel=1e-12)
+
+
+def test_finer_meshes_are_nearer_to_the_limit_and_quadratic_ones_nearer_still():
+    """The deflections are those of an independent code: Saint Venant-Kirchhoff, q = 20 Pa."""
+    family = replace(discretisation.FAMILIES["beam"], linear=((4, 1, 1), (8, 2, 2), (16, 4, 4)))
+    rows = discretisation.discretisations(family, SaintVenantKirchhoff(0.3), repeats=1)
+    tips = [mesh.value for mesh in rows]
+    known = [-18.7537, -24.79226, -27.28787, -27.72827, -28.2134, -28.3413]
+    assert tips == pytest.approx(known, abs=5e-5)
+    linear, quadratic = rows[:3], rows[3:]
+    for each in (linear, quadratic):
+        assert all(a.error > b.error for a, b in itertools.pairwise(each))
+    assert all(a.dofs == b.dofs for a, b in zip(linear[1:], quadratic, strict=False))
+    assert all(a.error > b.error for a, b in zip(linear[1:], quadratic, strict=False))
+    assert quadratic[-1].error == pytest.approx(1 - 28.3413 / 28.387, rel=0.02)
+
+
+def test_where_there_is_no_limit_the_finest_quadratic_mesh_stands_for_it():
+    few = ((1, 1, 1, 2, 4), (1, 1, 1, 3, 8))
+    family = replace(discretisation.FAMILIES["propeller"], linear=few, quadratic=few)
+    rows = discretisation.discretisations(family, NeoHookeanLn(0.3), repeats=1)
+    assert [(mesh.cells, mesh.degree) for mesh in rows] == [(few[0], 1), (few[1], 1), (few[0], 2)]
+    assert rows[0].error > rows[1].error > rows[2].error > 0
+    assert rows[2].value == pytest.approx(5.1e-3, rel=0.1)  # the blades bend, tips by 0.05 L
+
+
+@pytest.mark.slow
+def test_each_size_is_measured_in_a_process_of_its_own():
+    rows = [row for part in beams.sizes([2, 3], loads=2) for row in part]
+    assert sorted({row.dofs for row in rows}) == [3 * 9 * 9, 3 * 13 * 16]
+    whole = [row for row in rows if row.case.startswith("fcnn")]
+    assert [row.parameters for row in whole] == [4 * n**2 + 7 * n for n in (243, 624)]
+    assert all(row.peak_memory_mb > 100 for row in rows)
+
+
+def test_exponents_are_slopes():
+    sizes = [10, 100, 1000]
+    assert beams.exponent(sizes, [3e-4 * n**1.5 for n in sizes]) == pytest.approx(1.5)
+    assert beams.exponent([10], [1.0]) != beams.exponent([10], [1.0])
+
+
+def test_variants_of_a_method_have_its_colour_and_others_have_colours_of_their_own():
+    names = ["fcnn", "fcnn_plain", "pod, hybrid", "Newton to 1e-06", "paper, mse", "mine", "other"]
+    found = method_colours(names)
+    assert found["fcnn"] == found["fcnn_plain"] == METHOD_COLOURS["fcnn"]
+    assert found["pod, hybrid"] == METHOD_COLOURS["pod"]
+    assert found["Newton to 1e-06"] == METHOD_COLOURS["Newton"]
+    assert found["paper, mse"] == METHOD_COLOURS["paper"]
+    assert found["mine"] not in METHOD_COLOURS.values()
+    assert len(set(found.values())) == 6
+    every = [*METHOD_COLOURS.values(), *OTHER_COLOURS]
+    assert len(set(every)) == len(every)
