@@ -147,24 +147,6 @@ def test_preparing_twice_solves_nothing(offline, folder, monkeypatch):
     assert written() == before != {}
 
 
-# ------------------------------------------------------------------ young: one data set for all
-
-
-def test_the_moduli_are_those_of_the_scene_that_reads_the_data_set(
-    scene, make_scene, offline, folder
-):
-    """u/L depends on f/(E L^2) only, so a data set is valid for every modulus and size."""
-    wide = make_scene(young=[1e6, 2e11], size=(1.0, 0.25, 0.25))
-    module = DataModule(wide, folder=str(folder), train=12, **SIZES)
-    here, there = offline().samples("train"), module.samples("train")
-    assert torch.equal(here.force, there.force)
-    assert torch.equal(here.displacement, there.displacement)
-    assert (here.young == 4500.0).all()
-    assert torch.equal(there.young, wide.loads.sample((0, 0), range(12)).young)
-    assert len(there.young.unique()) == 12
-    assert torch.equal(next(iter(module.val_dataloader())).young, module.samples("val").young)
-
-
 # ------------------------------------------------------------------ symmetry
 
 
