@@ -301,21 +301,6 @@ def test_experiments_are_combined(compose):
     assert cfg.loss._target_.endswith("LrStar")
 
 
-def test_loads_of_different_seeds_are_different_data(compose, scene, tmp_path):
-    folders = set()
-    for seed in (0, 1):
-        cfg = compose("folder=.", f"data.seed={seed}", command="train")
-        folders.add(build.instantiate(cfg, "data", scene=scene).store.folder)
-    assert len(folders) == 2
-
-
-def test_the_seed_shuffles_batches_and_leaves_the_loads(compose):
-    cfg = compose("folder=.", "seed=5", command="train")
-    assert cfg.data.shuffle_seed == 5
-    assert cfg.data.seed == 0
-    assert np.isfinite(cfg.optimizer.lr)
-
-
 def test_small_loads_are_small_in_force_and_in_area(scene_of):
     scene = scene_of("loads=modal_small", *SMALL["beam"], "solver.linear=superlu")
     loads = scene.loads
