@@ -94,7 +94,7 @@ class DataSet:
     @property
     def _tried(self) -> int:
         """Number of the loads wanted that have been tried, those of other parts included."""
-        return sum(len(self.store.tried(k) & set(range(n))) for k, n in self.sizes.items())
+        return sum(k < size for split, size in self.sizes.items() for k in self.store.tried(split))
 
     def skipped_work(self) -> list[str]:
         """Return one line for each kind of work that is not needed."""

@@ -123,17 +123,6 @@ def test_a_batch_is_a_copy(offline):
     assert torch.equal(module.samples("train").force, before)
 
 
-def test_the_plan_counts_what_is_there(offline, scene, folder, tmp_path):
-    where, line = offline().skipped_work()
-    assert str(folder) in where
-    assert scene.fingerprint[:12] in where
-    assert line.startswith("20 of 20 loads not solved again")
-    assert offline(train=30).skipped_work()[1].startswith("20 of 38 loads not solved again")
-    (where,) = DataModule(scene, folder=str(tmp_path / "new"), workers=0).skipped_work()
-    assert str(tmp_path / "new") in where
-    assert not (tmp_path / "new").exists(), "a plan computes nothing and writes nothing"
-
-
 def test_preparing_twice_solves_nothing(offline, folder, monkeypatch):
     def written():
         return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -56,7 +56,7 @@ def totals(folder: Path) -> tuple[int, float, float, float]:
     Lines that do not give these numbers are left out.
     """
     keys = "loads", "seconds", "core_seconds"
-    rows = [[line.get(key) for key in keys] for line in read_jsonl(folder / NAME)]
+    rows: list[list[Any]] = [[line.get(key) for key in keys] for line in read_jsonl(folder / NAME)]
     valid = [row for row in rows if all(map(is_number, row))]
     loads, wall, core = (sum(row[k] for row in valid) for k in range(len(keys)))
     return len(valid), loads, wall, core

@@ -89,7 +89,7 @@ def digest(name: str, columns: Columns) -> str:
     found = hashlib.sha256(name.encode())
     for key, column in sorted(columns.items()):
         found.update(f" {key} {column.dtype} {tuple(column.shape)} ".encode())
-        found.update(column.contiguous().numpy())
+        found.update(column.numpy().tobytes())
     return found.hexdigest()
 
 
