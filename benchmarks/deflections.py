@@ -11,7 +11,7 @@ from benchmarks.study import picture
 from dpl import Scene
 from dpl.data.solving.solve import LoadKey
 from dpl.data.solving.worker_pool import solve_loads
-from dpl.data.storage.manifest import STREAMS
+from dpl.data.storage.store import STREAMS
 
 BINS = 20
 

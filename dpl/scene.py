@@ -231,7 +231,6 @@ class Scene:
     def describe(self) -> list[tuple[str, str]]:
         """Return names and values of the body, its supports, its law and its loads."""
         problem, loads, law = self.problem, self.loads, self.problem.material
-        log = ", uniform in log E" if loads.moduli.is_log else ""
         sides = (problem.points.amax(dim=0) - problem.points.amin(dim=0)) * self.length
         cells = CELLS[problem.mesh.elem.refdom.name]
         fixed = int((~problem.free).any(dim=1).sum())
@@ -252,7 +251,7 @@ class Scene:
                 f"{problem.points.numel():,} degrees of freedom",
             ),
             ("supports", f"{fixed:,} nodes {moved}{springs}"),
-            ("law", f"{law.describe()}, {law.describe_rest(loads.moduli)}{log}"),
+            ("law", f"{law.describe()}, {law.describe_rest(loads.moduli)}{_scale(loads.moduli)}"),
             (
                 "loads",
                 f"{type(loads).__name__}; the largest of {FEW}: {force:.3g} {unit}{bends}",
@@ -309,7 +308,11 @@ def _modulus(moduli: ParameterRange) -> str:
     low, high = moduli
     if low == high:
         return f"E = {low:.4g} Pa"
-    return f"E from {low:.4g} to {high:.4g} Pa{', uniform in log E' if moduli.is_log else ''}"
+    return f"E from {low:.4g} to {high:.4g} Pa{_scale(moduli)}"
+
+
+def _scale(moduli: ParameterRange) -> str:
+    return ", uniform in log E" if moduli.is_log else ""
 
 
 def _plain(identity: Any) -> Any:

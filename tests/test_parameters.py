@@ -11,7 +11,7 @@ from dpl import DataSetError, Sample, fem
 from dpl.config import build as run
 from dpl.data import DataModule, Store, Stream
 from dpl.data.storage.integrity import verify
-from dpl.data.storage.shard import decode_shard
+from dpl.data.storage.shard import read_shard
 from dpl.evaluation import evaluate
 from dpl.evaluation.report import measure
 from dpl.fem.materials.tensors import green_lagrange
@@ -242,20 +242,18 @@ def test_a_data_set_of_another_range_is_refused(sets, make_scene, scene):
 
 
 def test_a_shard_with_or_without_poissons_ratios_is_read_as_such_only(sets, data):
-    content = (sets.store.folder / sets.store.shards()[0]["file"]).read_bytes()
     with pytest.raises(ValueError, match="parameters has shape"):
-        decode_shard(content, (45, 3), 8)
-    content = (data.store.folder / data.store.shards()[0]["file"]).read_bytes()
+        read_shard(sets.store.shards()[0].path, (45, 3), 8)
     with pytest.raises(ValueError, match="parameters has shape"):
-        decode_shard(content, (45, 3), 7, 1)
+        read_shard(data.store.shards()[0].path, (45, 3), 7, 1)
 
 
 def test_verify_finds_other_poissons_ratios(sets):
     from dpl.data.storage.integrity import check_shard
 
-    line = sets.store.shards()[0]
-    shard = sets.store.read_shard(line)
-    stream = sets.store.stream(line["split"])
+    first = sets.store.shards()[0]
+    shard = sets.store.read(first.path)
+    stream = sets.store.stream(first.split)
     assert check_shard(sets.scene, stream, shard) == ""
     shard["parameters"] = shard["parameters"].flip(0)
     assert "other parameters" in check_shard(sets.scene, stream, shard)

@@ -7,6 +7,7 @@ import logging
 import math
 import os
 import re
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -66,7 +67,8 @@ def command(
                 with dry_run.initialized(args) as engine:
                     if args.help:
                         about = sys.modules[task.__module__].__doc__ or ""
-                        return print(help_text.page(args.config_name, about, args.overrides))
+                        page = help_text.page(args.config_name, about, args.overrides)
+                        return print(page, flush=True)
                     cfg = dry_run.check(args, rehearse, keys)
                     if not args.cfg and args.info is None:
                         return dry_run.run(engine, args, guarded, cfg)
@@ -92,6 +94,9 @@ def readable_errors() -> Iterator[None]:
     except YAMLError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
+    except BrokenPipeError:  # the reader of the output has ended, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the exit flushes it again
+        sys.exit(128 + signal.SIGPIPE)
     except (OSError, RuntimeError) as error:
         if (cause := _failed_access(error)) is None:
             raise

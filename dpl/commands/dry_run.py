@@ -24,7 +24,6 @@ from dpl.config import ConfigError
 
 BASIC = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
 REMOTE = "submitit"  # launchers on other machines, whose hardware may differ
-BODY = ("mesh", "fixed", "regions", "supports", "forces", "loads")  # keys that may name groups
 SAME = ("seed", "run", "folder")  # keys on which the validity of a job does not depend
 
 
@@ -95,9 +94,6 @@ def check(
         return None
     place = _folder(first, "run" if jobs is None else "sweep")
     every = [overrides.job(cfg) for cfg in ([first] if jobs is None else jobs)]
-    bodies = {str(OmegaConf.masked_copy(cfg, BODY)): cfg for cfg in every}
-    for cfg in bodies.values():
-        config.check_groups(cfg)
     for cfg in every:
         config.check(cfg, keys=keys)
     if jobs is not None and rehearse is not None and REMOTE not in str(first.hydra.launcher):

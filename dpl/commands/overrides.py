@@ -19,7 +19,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dpl import config
 from dpl.config import ConfigError, validation
 from dpl.version import install
 
@@ -68,32 +67,21 @@ def parsed(line: str) -> Override:
 def composed(name: str, lines: Sequence[str]) -> DictConfig:
     """Return the configuration of a command with overrides, including the node `hydra`.
 
-    Where Hydra refuses a key, it advises to add it by `+`. All keys are then added, so that
-    `validation` finds the one that does not exist; its message is more useful.
-
-    Raises a `ConfigError` if an override cannot be applied.
+    Raises a `ConfigError` if an override cannot be applied: with the most similar key of the same
+    node if there is one, else with the message of Hydra.
     """
-    refusal: ConfigError | None = None
     try:
         cfg = hydra.compose(name, overrides=list(lines), return_hydra_config=True)
     except REFUSED as error:
-        forced = [_with_force(name, parsed(line)) for line in lines]
-        refusal = ConfigError(_in_one_line(str(error)))
-        try:
-            cfg = hydra.compose(name, overrides=forced, return_hydra_config=True)
-        except REFUSED:
-            raise refusal from error
-        _check_spelling(cfg, str(error))
-    added = [line for line in lines if line[0] != "~" and (line[0] == "+" or refusal)]
-    keys = {line.lstrip("+").partition("=")[0] for line in added}
+        _check_options(name, lines)
+        _check_spelling(name, lines, str(error))
+        raise ConfigError(_in_one_line(str(error))) from error
+    keys = {line[1:].lstrip("+").partition("=")[0] for line in lines if line[0] == "+"}
     if new := {key for key in keys if "." not in key and not options(name, key)}:
         known = {str(key) for key in hydra.compose(name)}
         for key in new - known:
             message = validation.suggestion(key, known)
             raise ConfigError(f"{key}: this command has no such key; {message}")
-    if refusal is not None:
-        config.check(job(cfg), keys=[(object, " ".join(map(str, cfg)))], first=keys)
-        raise refusal
     return cfg
 
 
@@ -105,29 +93,28 @@ def job(cfg: DictConfig) -> DictConfig:
     return found
 
 
-def _check_spelling(cfg: DictConfig, message: str) -> None:
-    """Raise a `ConfigError` if the key that Hydra refuses resembles a key of the same node.
+def _check_options(name: str, lines: Sequence[str]) -> None:
+    """Raise a `ConfigError` if the option of a group is a number or null."""
+    for one in map(parsed, lines):
+        known = options(name, one.key_or_group)
+        if known and not one.is_delete() and not isinstance(one.value(), str | list):
+            remedy = f"~{one.key_or_group} leaves it out"
+            raise ConfigError(f"{one.input_line} must be one of {', '.join(known)}; {remedy}")
 
-    Nothing that the configuration names is imported for this.
-    """
-    if found := re.match(r"Could not override '(([\w.]+)\.(\w+))'", message):
-        node = OmegaConf.select(cfg, found[2])
-        known = {str(key) for key in node} - {found[3]} if isinstance(node, DictConfig) else set()
+
+def _check_spelling(name: str, lines: Sequence[str], message: str) -> None:
+    """Raise a `ConfigError` if the key that Hydra refuses resembles a key of the same node."""
+    if found := re.match(r"Could not override '((?:([\w.]+)\.)?(\w+))'", message):
+        others = [line for line in lines if not line.startswith(f"{found[1]}=")]
+        try:
+            cfg = hydra.compose(name, overrides=others)
+        except REFUSED:  # its message names the first of several
+            return
+        node = OmegaConf.select(cfg, found[2]) if found[2] else cfg
+        known = [*map(str, node)] if isinstance(node, DictConfig) else []
         if near := difflib.get_close_matches(found[3], known, 1, SIMILAR):
-            place = f"{found[2]}.{near[0]}"
+            place = ".".join(filter(None, (found[2], near[0])))
             raise ConfigError(f"{found[1]}: there is no such key; did you mean {place}?")
-
-
-def _with_force(name: str, one: Override) -> str:
-    """Return an override that adds its key if it does not exist; raise for an invalid option."""
-    group, line = one.key_or_group, one.input_line or ""
-    if one.is_delete():
-        return line
-    if not (known := options(name, group)):
-        return f"++{line.lstrip('+')}"
-    if not isinstance(one.value(), str | list):
-        raise ConfigError(f"{line} must be one of {', '.join(known)}; ~{group} leaves it out")
-    return line
 
 
 def _in_one_line(message: str) -> str:

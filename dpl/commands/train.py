@@ -18,8 +18,6 @@ from dpl import config, data, evaluation, training
 from dpl.commands import cli
 from dpl.system.files import DataSetError
 
-OF_GRADIENT_DESCENT = ("loss", "optimizer", "scheduler", "trainer")  # keys that a fit ignores
-
 
 def parts(cfg: DictConfig) -> tuple["dpl.Scene", "data.DataModule", "dpl.Surrogate", Any]:
     """Return scene, data, surrogate and trainer of a run without solving or writing."""
@@ -75,6 +73,8 @@ def _train(cfg: DictConfig) -> float | None:
     import torch
     from lightning.pytorch.loggers import TensorBoardLogger
 
+    from dpl.config.resume import OF_GRADIENT_DESCENT
+
     folder = Path(cfg.folder)
     scene, module, surrogate, trainer = parts(cfg)
     unused = OF_GRADIENT_DESCENT if surrogate.predictor.is_closed_form else ()
@@ -85,7 +85,7 @@ def _train(cfg: DictConfig) -> float | None:
         config.show_plan(scene, module, surrogate, folder=_from_here(folder), verbose=verbose)
         _show_unused(surrogate, unused)
         if not trainer.fast_dev_run:
-            config.save_config(cfg, folder)
+            config.save_config(cfg, folder, without=unused)
     smallest: float | None = None
     try:
         if surrogate.predictor.is_closed_form:

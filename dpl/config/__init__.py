@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     )
     from dpl.config.plain import (
         check,
-        check_groups,
         error_in,
         files_of_run,
         hyperparameters,

@@ -6,7 +6,6 @@ missing run is reported at once.
 
 import contextlib
 import typing
-import warnings
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from dpl.config import validation
 from dpl.config.validation import ConfigError
 from dpl.system.files import LOADABLE, DataSetError
 
-TAG = "dpl.fem.Tag"  # call of a region that a mesh file names
 MAX_BYTES = 100_000  # of the configuration of a run
 NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its result
     *("run", "folder", "ckpt_path", "trust", "data.folder"),
@@ -78,47 +76,10 @@ def _columns(node: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
             yield place, str(value) if isinstance(value, list) else value
 
 
-def check(
-    cfg: DictConfig,
-    *,
-    trust: bool = True,
-    keys: validation.Keys = (),
-    first: Collection[str] = (),
-) -> None:
-    """Check a configuration without calling anything, see `dpl.config.validation.check`.
-
-    The nodes of the keys `first` are checked before the others, whose classes take seconds to
-    import.
-    """
+def check(cfg: DictConfig, *, trust: bool = True, keys: validation.Keys = ()) -> None:
+    """Check a configuration without calling anything, see `dpl.config.validation.check`."""
     written = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg))
-    resolved = to_container(cfg)
-    roots = {key.partition(".")[0] for key in first}
-    for chosen in filter(None, (roots & resolved.keys(), resolved.keys())):
-        parts = ({key: node[key] for key in node if key in chosen} for node in (written, resolved))
-        validation.check(*parts, trust=trust, keys=keys)
-
-
-def check_groups(cfg: DictConfig) -> None:
-    """Raise a `ConfigError` if a `dpl.fem.Tag` names no part of the mesh file of a configuration.
-
-    A file that cannot be read is reported by its key when the scene is built.
-    """
-    found = to_container(cfg)
-    calls = {p: node for p, node in validation.iter_nodes(found) if isinstance(node, dict)}
-    tags = {p: node.get("name") for p, node in calls.items() if node.get("_target_") == TAG}
-    file = calls.get("mesh", {})
-    if not tags or file.get("_target_") != "dpl.fem.read_mesh":
-        return
-    from dpl.fem import Tag, read_mesh
-
-    try:
-        with warnings.catch_warnings(action="ignore"):  # printed when the scene is built
-            mesh = read_mesh(**{key: file[key] for key in file if key != "_target_"})
-    except (OSError, MemoryError, TypeError, ValueError):
-        return
-    for place, name in tags.items():
-        with error_in(place):
-            Tag(str(name)).facets(mesh)
+    validation.check(written, to_container(cfg), trust=trust, keys=keys)
 
 
 def require_keys(cfg: DictConfig, *keys: str) -> None:

@@ -2,7 +2,7 @@
 
 import shutil
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from dpl.config.validation import ConfigError
 from dpl.fem import write_mesh_exactly
 from dpl.system.files import atomic_write
 
+OF_GRADIENT_DESCENT = ("loss", "optimizer", "scheduler", "trainer")  # not stored for fitted models
 OF_THE_SESSION = {"run", "folder", "ckpt_path", "callbacks", "logger", "paths", "extras", "trust"}
 MACHINE = tuple(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy"))
 MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
@@ -35,10 +36,11 @@ MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
 }
 
 
-def save_config(cfg: DictConfig, folder: Path) -> None:
+def save_config(cfg: DictConfig, folder: Path, *, without: Collection[str] = ()) -> None:
     """Write a configuration without interpolations, and copies of its files, to a folder.
 
-    A mesh is written as it was checked; other files are copied byte for byte.
+    The keys `without` are left out. A mesh is written as it was checked; other files are copied
+    byte for byte.
 
     Raises a `ConfigError` if the folder contains another run that is not resumed.
     """
@@ -57,7 +59,8 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
                 write_mesh_exactly(Path(file.name), instantiate(source, "mesh"))
             else:
                 shutil.copyfileobj(origin, file)
-    (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(to_container(cfg))))
+    kept = {key: node for key, node in to_container(cfg).items() if key not in without}
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(kept)))
 
 
 def _resumed(cfg: DictConfig) -> Path | None:
@@ -201,7 +204,8 @@ def _changes(theirs: dict[str, Any], ours: dict[str, Any]) -> list[str]:
         }
         for node in (theirs, ours)
     )
-    free = tuple(f"{key}." for key in (*NOT_IDENTITY, *MAY_CHANGE_ON_RESUME))
+    unused = (key for key in OF_GRADIENT_DESCENT if key not in theirs)
+    free = tuple(f"{key}." for key in (*NOT_IDENTITY, *MAY_CHANGE_ON_RESUME, *unused))
     return [
         f"{key} was {before.get(key)}, is {now.get(key)}"
         for key in sorted(before.keys() | now.keys())

@@ -1,9 +1,8 @@
 """Read the folder of a training run."""
 
 import contextlib
-import math
+import json
 import os
-import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,16 +13,16 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpl import data, inference, training
 from dpl.config import validation
-from dpl.config.build import SCENE, build_scene, build_trained, instantiate, law_and_moduli
+from dpl.config.build import SCENE, build_scene, build_trained, instantiate
 from dpl.config.plain import files_of_run, read_config, require_keys, to_container
 from dpl.config.validation import ConfigError
-from dpl.fem.mesh.generators import longest_side
 from dpl.scene import Scene
 from dpl.system.memory import at_most
 from dpl.training import checkpoints
 
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
-PREDICTION = (*SCENE, "fixed", "regions", "model", "seed")  # keys of a run that `load` reads
+OF_SCENE = (*SCENE, "fixed", "regions")
+PREDICTION = (*OF_SCENE, "model", "seed")  # keys of a run that `load` reads
 UNUSABLE = (  # errors of a damaged checkpoint
     *(OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, ArithmeticError),
 )
@@ -46,7 +45,7 @@ def with_copied_files(
         ConfigError: A copy is required and missing.
     """
     found, files = to_container(cfg), {}
-    scene = {key: found[key] for key in (*SCENE, "fixed", "regions") if key in found}
+    scene = {key: found[key] for key in OF_SCENE if key in found}
     for key, call, option in list(validation.options_with_files(scene)):
         from dpl.fem import read_mesh  # which imports meshio
 
@@ -115,8 +114,7 @@ def load_run(
 
     Args:
         folder: Folder of the run.
-        scene: Scene of the run, if it is built already. It is used if it has the size and the
-            Young's moduli of the run, which its fingerprint does not contain.
+        scene: Scene of the run, if it is built already.
         trust: Import and call objects outside this package, such as your own law, that the
             configuration names.
         keys: Keys of the configuration to read, at least `PREDICTION`; None for all.
@@ -132,7 +130,7 @@ def load_run(
         checkpoint = checkpoints.read(best)
         if (points := checkpoint.get(checkpoints.DATA, {}).get("points")) and "data" in cfg:
             cfg.data.train = int(points[-1][0])
-    scene = _scene_of_run(cfg, best, checkpoint, scene, trust=trust)
+    scene = scene or _scene_of_run(cfg, best, checkpoint, trust=trust)
     surrogate = build_trained(cfg, scene)
     with usable(best):
         checkpoints.check_scene(checkpoint, scene)
@@ -152,11 +150,9 @@ def usable(checkpoint: str | Path) -> Iterator[None]:
 
 
 def _scene_of_run(
-    cfg: DictConfig, weights: Path, checkpoint: dict[str, Any], known: Scene | None, *, trust: bool
+    cfg: DictConfig, weights: Path, checkpoint: dict[str, Any], *, trust: bool
 ) -> Scene:
     """Return the scene of a run; its files are read from the folder of the run.
-
-    It is `known` if that has the size and the Young's moduli of the run.
 
     Without `trust` the run needs copies of its files, and its checkpoint bounds the number of
     nodes: no network has fewer weights than its body has nodes.
@@ -164,22 +160,12 @@ def _scene_of_run(
     require_keys(cfg, *SCENE)
     own, _ = with_copied_files(cfg, weights.parent.parent, required=not trust)
     if trust:
-        return _reused_or_built(own, known)
+        return build_scene(own)
     most = sum(t.numel() for t in checkpoint["state_dict"].values() if torch.is_tensor(t))
     if isinstance(nodes := checkpoint.get("nodes"), int):
         most = min(nodes, most)
     with at_most(most, f"{weights} is of no larger body"):
-        return _reused_or_built(own, known)
-
-
-def _reused_or_built(cfg: DictConfig, known: Scene | None) -> Scene:
-    """Return a known scene if it has the size and the moduli of a configuration, else a new one."""
-    if known is None or law_and_moduli(cfg)[1] != known.loads.moduli:
-        return build_scene(cfg)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # printed when the scene was built
-        length = longest_side(instantiate(cfg, "mesh").p.T)
-    return known if math.isclose(length, known.length) else build_scene(cfg)
+        return build_scene(own)
 
 
 def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":
@@ -202,7 +188,7 @@ def load_runs(
 ) -> dict[str, tuple[DictConfig, "training.TrainedSurrogate"]]:
     """Return the configurations and surrogates of named runs in a folder, or of all.
 
-    They share one scene, except runs of another size or range of Young's moduli.
+    Runs whose configurations have the same keys of the scene share one scene.
 
     Raises:
         ConfigError: There are none, or one cannot be used or belongs to another scene.
@@ -212,13 +198,16 @@ def load_runs(
     if not names:
         raise ConfigError(f"run = {folder} contains no runs; train some with run={folder}/NAME")
     runs: dict[str, tuple[DictConfig, training.TrainedSurrogate]] = {}
-    scene: Scene | None = None
+    scenes: dict[str, Scene] = {}  # by their part of the configuration
     for name in names:
-        runs[name] = load_run(Path(folder) / name, trust=trust, scene=scene)
-        own = runs[name][1].scene
-        scene = scene or own
-        if own.fingerprint != scene.fingerprint:
-            differences = "; ".join(scene.differences(own.identity()))
+        config, _ = files_of_run(Path(folder) / name)
+        part = {key: node for key, node in read_config(config).items() if key in OF_SCENE}
+        known = scenes.get(key := json.dumps(part))
+        runs[name] = load_run(Path(folder) / name, trust=trust, scene=known)
+        own = scenes.setdefault(key, runs[name][1].scene)
+        first = next(iter(scenes.values()))
+        if own.fingerprint != first.fingerprint:
+            differences = "; ".join(first.differences(own.identity()))
             raise ConfigError(
                 f"run = {folder}: {name} is of another scene than {names[0]}: {differences}"
             )

@@ -11,7 +11,7 @@ from rich import progress
 from dpl.data.dataset import DataSet
 from dpl.data.solving.solve import SolvedLoad
 from dpl.data.storage.journal import Session
-from dpl.data.storage.manifest import STREAMS
+from dpl.data.storage.store import STREAMS
 
 REFRESH = 0.5  # time between two updates of the progress bar [s]
 PATIENCE = 1.0  # time after which the end of the solves in progress is announced [s]

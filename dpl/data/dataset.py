@@ -1,12 +1,12 @@
 """A data set with the sizes that are wanted, and its generation with progress and interruption."""
 
-import hashlib
 import json
 import sys
+import time
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +19,15 @@ from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
 from dpl.data.storage.acceptance import bias_warning
 from dpl.data.storage.integrity import repair, verify
 from dpl.data.storage.journal import Session
-from dpl.data.storage.manifest import merge_entries, read_manifest, rewrite, shard_name, tried_loads
-from dpl.data.storage.pending import clean_partial_files
-from dpl.data.storage.shard import concatenate
-from dpl.data.storage.store import FORMAT, MODES, Store, runs
+from dpl.data.storage.store import FORMAT, MODES, Store, blocks
 from dpl.scene import Scene
 from dpl.system.checks import check_range
-from dpl.system.files import append_jsonl, exclusive_lock, write_file
+from dpl.system.files import exclusive_lock, write_file
 from dpl.version import __version__
 
 MAX_LOADS = 10**7  # in a split
 MAX_WORKERS = 1024
+PARTIAL_FILE_AGE = 10.0  # age above which the writer of an unfinished file is taken for dead [s]
 
 
 @dataclass(frozen=True)
@@ -90,13 +88,17 @@ class DataSet:
     def describe(self) -> list[tuple[str, str]]:
         """Return the numbers of loads, and how many of them have to be solved."""
         sizes = ", ".join(f"{size:,} {split}" for split, size in self.sizes.items() if size)
-        missing = sum(len(self.store.missing(*split)) for split in self.sizes.items())
+        missing = sum(self.sizes.values()) - self._tried
         return [("data", f"loads: {sizes}; {missing:,} of them to be solved")]
+
+    @property
+    def _tried(self) -> int:
+        """Number of the loads wanted that have been tried, those of other parts included."""
+        return sum(k < size for split, size in self.sizes.items() for k in self.store.tried(split))
 
     def skipped_work(self) -> list[str]:
         """Return one line for each kind of work that is not needed."""
-        wanted = sum(self.sizes.values())
-        there = wanted - sum(len(self.store.missing(*split)) for split in self.sizes.items())
+        wanted, there = sum(self.sizes.values()), self._tried
         same = " with these boundary values over E and L" if self.scene.has_boundary_values else ""
         sizes = "size" if self.scene.problem.follower_loads.ranges else "size and Young's modulus"
         lines = [
@@ -131,17 +133,12 @@ class DataSet:
             progress.TextColumn("{task.fields[news]}"),
             progress.TimeRemainingColumn(),
         )
-        jobs = {
-            LoadKey(self.store.stream(split), number)
-            for split, numbers in missing.items()
-            for number in numbers
-        }
-        if not jobs:
+        total = sum(map(len, missing.values()))
+        if not total and not self.store.scattered(self.shard, self.shards):
             return
-        completed = len(jobs & self.store.pending.files().keys())
         session = Session(workers=self.workers)
         with GracefulShutdown() as stop, progress.Progress(*columns, refresh_per_second=2) as bars:
-            bar = bars.add_task("", total=len(jobs), completed=completed, news="")
+            bar = bars.add_task("", total=total, news="", visible=total > 0)
             try:
                 # closed first, which ends the workers
                 with closing(self.solve(missing.items(), stop)) as solving:
@@ -152,12 +149,6 @@ class DataSet:
                 session.append_to_journal(self.store.folder)
             stop.exit()
 
-    @property
-    def _manifest(self) -> Path:
-        """Path of the manifest of this writer."""
-        part = "" if self.shards == 1 else f"-{self.shard}-of-{self.shards}"
-        return self.store.folder / f"manifest{part}.jsonl"
-
     def create(self) -> None:
         """Write `scene.json` and the modes if they are missing.
 
@@ -165,8 +156,7 @@ class DataSet:
             DataSetError: The folder holds something else.
         """
         folder, scene = self.store.folder, self.scene
-        self.store.shards()
-        if (folder / "scene.json").exists():
+        if self.store.exists():
             return
         folder.mkdir(parents=True, exist_ok=True)
         write_file(folder / MODES, save(dict(scene.loads.arrays())))
@@ -184,8 +174,8 @@ class DataSet:
     ) -> Generator[SolvedLoad, None, None]:
         """Solve loads that have not been tried; yield each as soon as it is solved.
 
-        Each solved load is written to a pending file at once, and a shard as soon as all its loads
-        are solved, in order. Pending loads of an interrupted run are not solved again.
+        Each solved load is written to a file at once. The files of a block are merged as soon as
+        all its loads that are wanted have been tried.
 
         Args:
             loads: Splits with numbers of loads, in the order of the solves; read when they are due.
@@ -197,51 +187,36 @@ class DataSet:
         self.create()
         store = self.store
         with exclusive_lock(store.folder, self.shard, self.shards):
-            clean_partial_files(store.folder)
-            pending = store.pending.files()
+            remove_unfinished(store.folder)
+            for block in store.scattered(self.shard, self.shards):  # of an interrupted session
+                store.merge(*block)
             tried = {
-                LoadKey(store.stream(line["split"]), number)
-                for line in store.shards()
-                for number in tried_loads(line)
+                LoadKey(store.stream(shard.split), number)
+                for shard in store.shards()
+                for number in shard.tried
             }
-            for job in pending.keys() & tried:  # killed between writing a shard and this removal
-                pending.pop(job).unlink(missing_ok=True)
-            files: list[list[LoadKey]] = []  # shards whose loads have been read from `loads`
+            unmerged: list[tuple[str, int, set[LoadKey]]] = []  # blocks with their loads wanted
 
             def jobs() -> Iterator[LoadKey]:
                 for split, numbers in loads:
-                    key = partial(LoadKey, store.stream(split))
-                    new = [number for number in numbers if key(number) not in tried]
-                    for run in runs(new):
-                        files.append([key(number) for number in run])
-                        yield from [job for job in files[-1] if job not in pending]
+                    for block, members in blocks(numbers):
+                        keys = [LoadKey(store.stream(split), number) for number in members]
+                        new = [key for key in keys if key not in tried]
+                        unmerged.append((split, block, set(new)))
+                        yield from new
+
+            def merge_complete_blocks() -> None:
+                while unmerged and unmerged[0][2] <= tried:
+                    store.merge(*unmerged.pop(0)[:2])
 
             for solved in solve_loads(
                 self.scene, jobs(), workers=self.workers, timeout=self.timeout, stop=stop
             ):
-                pending[solved.job] = store.pending.write(solved)
+                store.write(solved)
+                tried.add(solved.job)
                 yield solved
-                self._write_complete_shards(files, pending)
-            self._write_complete_shards(files, pending)
-            rewrite(self._manifest, read_manifest(self._manifest))
-            if self.shards == 1:
-                with suppress(OSError):  # it is not empty
-                    store.pending.folder.rmdir()
-
-    def _write_complete_shards(
-        self, files: list[list[LoadKey]], pending: dict[LoadKey, Path]
-    ) -> None:
-        """Write the first shards whose loads are all pending; remove them from both arguments."""
-        while files and all(job in pending for job in files[0]):
-            paths = [pending.pop(job) for job in files.pop(0)]
-            entries, columns = zip(*map(self.store.pending.read, paths), strict=True)
-            entry, content = merge_entries(entries), save(concatenate(columns))
-            name = shard_name(entry["split"], entry["first"])
-            write_file(self.store.folder / name, content)
-            sha256 = hashlib.sha256(content).hexdigest()
-            append_jsonl(self._manifest, {"file": name, "sha256": sha256, **entry})
-            for path in paths:  # a writer that starts now also removes loads that have a shard
-                path.unlink(missing_ok=True)
+                merge_complete_blocks()
+            merge_complete_blocks()
 
     def verify(self) -> Iterator[str]:
         """Yield one line for each flaw of the data set, and for missing loads.
@@ -249,10 +224,10 @@ class DataSet:
         Raises:
             DataSetError: There is no data set.
         """
-        files = len(self.store.shards()) + 1
-        for part, flaw in progress.track(verify(self.store), "verifying files", total=files):
+        files = len(self.store.files()) + 1
+        for path, flaw in progress.track(verify(self.store), "verifying files", total=files):
             if flaw:
-                yield f"{self.store.folder / part.file} {flaw}"
+                yield f"{path} {flaw}"
         for split, numbers in self.missing().items():
             if numbers:
                 yield (
@@ -262,14 +237,21 @@ class DataSet:
 
     def repair(self) -> Store:
         """Make damaged files again, also beyond the sizes wanted, and print the flaws."""
-        flaws = repair(self.store)
+        before = {split: self.store.tried(split) for split in self.sizes}
+        for path, action in repair(self.store):
+            print(f"{path} {action}")
         missing = self.missing()
-        for part, action in flaws:
-            print(f"{self.store.folder / part.file} {action}")
-            if part.split:
-                missing[part.split] = sorted({*missing[part.split], *part.loads})
         for split, numbers in missing.items():
-            if numbers:
-                print(f"{len(numbers)} loads of {split} are missing and are solved")
+            missing[split] = sorted({*numbers, *before[split]} - self.store.tried(split))
+            if missing[split]:
+                print(f"{len(missing[split])} loads of {split} are missing and are solved")
         self._solve_with_progress(missing)
         return self.fill()
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove the files that killed processes left unfinished in a folder or below it."""
+    for path in folder.rglob(".*.part"):
+        with suppress(FileNotFoundError):
+            if time.time() - path.stat().st_mtime > PARTIAL_FILE_AGE:
+                path.unlink()

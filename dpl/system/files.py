@@ -53,14 +53,14 @@ def atomic_write(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
         sync_folder(path.parent)
 
 
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file of a data set atomically.
+def write_file(path: Path, content: bytes, *, sync: bool = True) -> None:
+    """Write a file of a data set atomically, see `atomic_write`.
 
     Raises:
         DataSetError: `path` is a folder.
     """
     try:
-        with atomic_write(path) as file:
+        with atomic_write(path, sync=sync) as file:
             file.write(content)
     except IsADirectoryError:
         raise DataSetError(
@@ -175,12 +175,7 @@ def _read_npy(file: IO[bytes], size: int, row: tuple[int, ...]) -> NDArray[np.fl
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
-    """Return the JSON objects in the lines of a file, see `parsed_lines`, without other lines."""
-    return [line for line in parsed_lines(path) if line is not None]
-
-
-def parsed_lines(path: Path) -> list[dict[str, Any] | None]:
-    """Return the JSON object in each line of a file, None for a line that is none.
+    """Return the JSON objects in the lines of a file, without other lines.
 
     A file that does not exist has no lines.
 
@@ -192,11 +187,9 @@ def parsed_lines(path: Path) -> list[dict[str, Any] | None]:
         content = read_regular_file(path)
     found = []
     for line in content.splitlines():
-        value = None
         with suppress(ValueError, RecursionError):
-            value = json.loads(line)
-        found.append(value if isinstance(value, dict) else None)
-    return found
+            found.append(json.loads(line))
+    return [value for value in found if isinstance(value, dict)]
 
 
 @contextmanager

@@ -39,6 +39,16 @@ def test_help_and_the_configuration_of_every_command_import_no_torch(environment
     assert not list(tmp_path.iterdir())
 
 
+def test_help_ends_quietly_where_the_reader_of_its_output_has_ended(environment, tmp_path):
+    """As `--help | head` does; with the status of a process that SIGPIPE ends."""
+    line = f"{sys.executable} {ROOT / 'scripts/view.py'} --help | true; echo ${{PIPESTATUS[0]}}"
+    command = ["bash", "-c", line]
+    ended = subprocess.run(
+        command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False
+    )
+    assert (ended.stdout, ended.stderr) == ("141\n", "")
+
+
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_help_names_every_key(script, compose, name, tmp_path):
     ended = script(name, "--help", cwd=tmp_path)
@@ -58,7 +68,7 @@ def test_help_follows_the_options_of_the_command_line(script, tmp_path):
 def test_help_of_a_wrong_option_ends_with_one_line(script, tmp_path):
     ended = script("train", "--help", "modle=3", cwd=tmp_path)
     assert ended.status == 2
-    assert ended.err == "error: modle: this command has no such key; did you mean model?\n"
+    assert ended.err == "error: modle: there is no such key; did you mean model?\n"
 
 
 def test_help_of_a_benchmark_lists_options_and_comments_of_the_package(script, tmp_path):

@@ -12,12 +12,11 @@ from dpl.config import ConfigError, plain
 
 OPTIONS = "Available options in 'model': cnn fcnn gnn pod unrolled"
 EXPERIMENTS = "Available options in 'experiment': beam_nh_loss beam_poisson beam_svk "
-BRACKET = Path(__file__).parents[2] / "benchmarks/meshes/bracket.msh"
 NONSENSE = {  # command line -> what the one line says
     "train experiment=beam_yuong": f"Could not find 'experiment/beam_yuong' {EXPERIMENTS}",
     "generate experiment=beam_yuong": f"Could not find 'experiment/beam_yuong' {EXPERIMENTS}",
     "train hparams_search=podd": r"Could not find 'hparams_search/podd' .*: pod$",
-    "train modle=fcnn": r"^modle: this command has no such key; did you mean model\?$",
+    "train modle=fcnn": r"^modle: there is no such key; did you mean model\?$",
     "train +modle=fcnn": r"^modle: this command has no such key; did you mean model\?$",
     "train ~modle": r"^Could not delete from config. 'modle' does not exist",
     "train +port=3": r"^port: this command has no such key",
@@ -28,9 +27,10 @@ NONSENSE = {  # command line -> what the one line says
     "train hydra/launcher=jobblib": r"'hydra/launcher/jobblib' .*pip install .*launch",
     "train hydra.swep.dir=3": r"^Could not override 'hydra\.swep\.dir'",
     "train model=fcnn model.widht=3": r"^model\.widht: .*; did you mean model\.width\?$",
-    "train model.nodes=3": r"^model\.nodes: .*Unrolled has no such option; there are ",
+    "train model.nodes=3": r"^Could not override 'model\.nodes'\. .* use \+model\.nodes=3$",
+    "train +model.nodes=3": r"^model\.nodes: .*Unrolled has no such option; there are ",
     "train trainer.max_epoch=3": r"did you mean trainer\.max_epochs\?$",
-    "train callbacks.worst.every=3": r"^callbacks\.worst = {'every': 3} must be a call",
+    "train callbacks.worst.every=3": r"^Could not override 'callbacks\.worst\.every'",
     "train mesh.cell=tetra": r"^Could not override 'mesh\.cell'\. .* use \+mesh\.cell=tetra",
     "train +mesh.cel=tetra": r"^mesh\.cel: .* has no such option; did you mean mesh\.cell\?$",
     "train model=fcnn,cnn": r"^model=fcnn,cnn names several values; add -m",
@@ -41,9 +41,6 @@ NONSENSE = {  # command line -> what the one line says
     "train --config-dir nowhere": r"^--config-dir = nowhere must be an existing folder$",
     "train --config-name nowhere": r"^Cannot find primary config 'nowhere'",
     "train young=${nowhere}": r"^young: Interpolation key 'nowhere' not found$",
-    f"train mesh=file mesh.path={BRACKET} fixed=tag fixed.name=wal": (
-        r"^fixed: .*'wal'.*'body', 'bore', 'seat', 'wall'"
-    ),
     "train run=null": r"^run = null must be a text",
     "train run=${nowhere}": r"^run = \$\{nowhere\} must be a text",
     "train run=/proc/nope": r"^run = /proc/nope cannot be written: No such file",
@@ -55,7 +52,7 @@ NONSENSE = {  # command line -> what the one line says
     "train -m loss=mse,msee": r"Could not find 'loss/msee'",
     "train -m data.train=8,0": r"^data\.train = 0 must lie between",
     "train -m seed=0,1 optimizer.lr=1e-3,1e30": r"^optimizer\.lr = 1e\+30 must lie between",
-    "train model.base=quadratic": r"^model\.base = 'quadratic' must be one of linear or null",
+    "train model=fcnn model.base=cubic": r"^model\.base = 'cubic' must be one of linear or null",
     "train -m model.layers=2,1": r"^model: layers = 1 must be 2 or more",
     "train -m loss=lr_plus loss.weight=1,-1": r"^loss: weight = -1",
     "train -m fixed.axis=0,3": r"^fixed: axis = 3",
@@ -64,8 +61,8 @@ NONSENSE = {  # command line -> what the one line says
     "train data=online +data.train.error=1e-3": r"^data\.train\.error: dpl\.data\.Stream has no",
     "generate data._target_=dpl.data.DataModule": r"^data\._target_ = .*dpl\.data\.DataSet",
     "train data._target_=dpl.data.DataSet": r"^data\._target_ = .*dpl\.data\.DataModule",
-    "generate actoin=verify": r"^actoin: this command has no such key; did you mean action\?$",
-    "view rn=3": r"^rn: this command has no such key; did you mean run\?$",
+    "generate actoin=verify": r"^actoin: there is no such key; did you mean action\?$",
+    "view rn=3": r"^rn: there is no such key; did you mean run\?$",
     "evaluate": r"^run is missing",
 }
 PARTS = {"train": train.parts, "generate": generate.parts}
@@ -189,11 +186,8 @@ def test_a_folder_that_is_read_only_is_refused(tmp_path):
     "line",
     [
         "train modle=fcnn",
-        "train -m seed=range(0)",
         "train data.batch_size=0",
         "train model=fcnn trainer.max_epochs=-1",
-        "generate young=-1",
-        "train run=/proc/nope",
         "train data.folder=/dev/null",
         "train model=fcnn ~callbacks",
         "benchmark linear=[foo]",

@@ -206,19 +206,6 @@ def test_lr_star_sends_no_gradient_through_the_residual(scene, batch, monkeypatc
     assert any(tracked)
 
 
-def test_a_data_set_that_is_there_is_not_solved_again(data, calls, monkeypatch):
-    solved = []
-    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", lambda *job: solved.append(job))
-    assert data.skipped_work() == [
-        "one data set for every size and Young's modulus of this body: "
-        f"{data.store.folder}, of scene {data.scene.fingerprint[:12]}",
-        "20 of 20 loads not solved again: they are there",
-    ]
-    data.prepare_data()
-    assert solved == []
-    assert "factorise" not in calls
-
-
 def test_inputs_and_outputs_are_only_where_something_happens(scene):
     net = FCNN(scene)
     problem = scene.problem
@@ -236,14 +223,6 @@ def test_a_plan_computes_no_sample(scene, tmp_path, calls):
     assert where.startswith("one data set for every size and Young's modulus of this body")
     assert not (tmp_path / "none").exists()
     assert calls == {}
-
-
-def test_one_data_set_serves_every_size_and_modulus(make_scene, scene, folder, data):
-    """What the plan says of it: another size and range, and nothing is missing."""
-    other = make_scene(size=(1.0, 0.25, 0.25), young=[1e6, 2e11])
-    assert other.fingerprint == scene.fingerprint
-    module = DataModule(other, folder=str(folder), train=12, val=4, test=4, workers=0)
-    assert module.skipped_work()[1] == "20 of 20 loads not solved again: they are there"
 
 
 def test_images_under_symmetries_are_not_solved(scene, folder, data, calls, monkeypatch):

@@ -12,13 +12,12 @@ import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from laws import LAWS
 from omegaconf import OmegaConf
 from skfem.io.meshio import to_meshio
 
 from dpl.config import ConfigError, build, plain
 from dpl.data.solving.solve import LoadKey, solve_load
-from dpl.fem import ParameterRange, YoungPoissonMaterial, box, solve
+from dpl.fem import ParameterRange, box, solve
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -117,19 +116,6 @@ def test_every_load_family_draws_loads_that_newton_answers(scene_of, overrides, 
     amplitude, distance = scene.loads.project(load.force)
     assert (amplitude <= 1 + 1e-9).all()
     assert (distance < 1e-9).all()
-
-
-@pytest.mark.parametrize("material", LAWS)
-def test_laws_share_young_and_poisson_at_rest(material):
-    law = LAWS[material]
-    if not isinstance(law, YoungPoissonMaterial):  # moduli of its own: C10, C01, ...
-        assert 0 < law.poisson_ratio < 0.5
-        return
-    tangent = law.tangent(torch.zeros(3, 3, dtype=torch.float64))
-    mu, lam = 1 / 2.6, 0.3 / (1.3 * 0.4)
-    assert float(tangent[0, 0, 0, 0]) == pytest.approx(lam + 2 * mu)
-    assert float(tangent[0, 0, 1, 1]) == pytest.approx(lam)
-    assert float(tangent[0, 1, 0, 1]) == pytest.approx(mu)
 
 
 @pytest.mark.parametrize("name", options("experiment"))
@@ -299,21 +285,6 @@ def test_experiments_are_combined(compose):
     assert cfg.mesh == experiment.mesh
     assert cfg.data.train == experiment.data.train == 4095
     assert cfg.loss._target_.endswith("LrStar")
-
-
-def test_loads_of_different_seeds_are_different_data(compose, scene, tmp_path):
-    folders = set()
-    for seed in (0, 1):
-        cfg = compose("folder=.", f"data.seed={seed}", command="train")
-        folders.add(build.instantiate(cfg, "data", scene=scene).store.folder)
-    assert len(folders) == 2
-
-
-def test_the_seed_shuffles_batches_and_leaves_the_loads(compose):
-    cfg = compose("folder=.", "seed=5", command="train")
-    assert cfg.data.shuffle_seed == 5
-    assert cfg.data.seed == 0
-    assert np.isfinite(cfg.optimizer.lr)
 
 
 def test_small_loads_are_small_in_force_and_in_area(scene_of):

@@ -99,7 +99,76 @@ def test_no_key_of_a_stored_configuration_calls_anything_foreign(
             run_folder.checked_config(tmp_path, trust=resumed)
             accepted.append((place, call["_target_"]))
     assert not accepted
-    assert not accepted
+
+
+HARMFUL = [  # calls that would do harm
+    {"_target_": "os.system", "command": "touch harm"},
+    {"_target_": "builtins.eval", "_args_": ["open('harm', 'w')"]},
+    {"_target_": "builtins.exec", "_args_": ["open('harm', 'w')"]},
+    {"_target_": "subprocess.run", "args": ["touch", "harm"]},
+    {"_target_": "subprocess.Popen", "args": ["touch", "harm"]},
+    {"_target_": "pathlib.Path.touch", "self": "harm"},
+    {"_target_": "hydra.utils.call", "config": {"_target_": "os.system", "command": "touch harm"}},
+    {"_target_": "dpl.config.build.sys.exit", "_args_": [3]},
+    {"_target_": "dpl.config.instantiate", "cfg": {"x": {"_target_": "os.getcwd"}}, "key": "x"},
+    {"_target_": "dpl.config.load_run", "folder": "evil", "trust": True},
+    {"_target_": "dpl.config.validation.importlib", "name": "antigravity"},
+    {"_target_": "dpl.scene.replace", "func": "os.system"},
+    {"_target_": "dpl.system.files.append_jsonl", "path": "harm", "line": {"a": 1}},
+    {"_target_": "dpl.system.files.atomic_write", "path": "harm"},
+    {
+        "_target_": "dpl.fem.write_mesh",
+        "mesh": {"_target_": "dpl.fem.box"},
+        "path": "harm.vtk",
+    },
+    {"_target_": "benchmarks.peers.time_reference_code", "python": "touch", "program": "harm"},
+    {
+        "_target_": "lightning.pytorch.cli.instantiate_class",
+        "args": ["touch harm"],
+        "init": {"class_path": "os.system"},
+    },
+    {"_target_": "lightning.pytorch.cli.LightningCLI", "run": False},
+    {"_target_": "lightning.fabric.utilities.cloud_io._load", "path_or_url": "evil.ckpt"},
+    {"_target_": "torch.load", "f": "evil.ckpt", "weights_only": False},
+    {"_target_": "torch.optim.os.system", "command": "touch harm"},
+    {"_target_": "torch.optim.lr_scheduler.partial", "func": "os.system"},
+    {"_target_": "dpl", "a": 1},
+    {"_target_": "dpl."},
+    {"_target_": "..."},
+    {"_target_": 3},
+    {"_target_": None},
+    {"_target_": ["os.system"]},
+    {"_target_": {"_target_": "os.system", "command": "touch harm"}},
+    {"_target_": "dpl.fem.identity.partial", "func": "os.system"},
+    {"_target_": "lightning.pytorch.loggers.WandbLogger"},
+    *(
+        {"_target_": name, "path": "x"}
+        for name in (
+            "dpl.config.validation.importlib.import_module",  # a foreign module behind `dpl.`
+            "dpl.evaluation.tables.write",
+            "dpl.fem.mesh.generators.Sequence",
+            "torch.optim.Optimizer.__init__.__globals__",
+        )
+    ),
+]
+
+
+REFUSED = "(not called|must be|does not exist|cannot be called)"
+
+
+def test_a_run_calls_only_classes_and_functions_of_its_parts(stored, monkeypatch, tmp_path):
+    """Functions with a reach of their own lie in modules of the package too."""
+    cfg = stored()
+    monkeypatch.setattr(run_folder, "read_config", lambda path: cfg)
+    for key, call in itertools.product(("mesh", "loss", "trainer"), HARMFUL):
+        before = cfg[key]
+        cfg[key] = call
+        with pytest.raises(ConfigError, match=rf"{key}\b.*{REFUSED}"):
+            run_folder.checked_config(tmp_path)
+        cfg[key] = {"_target_": "dpl.training.MSE", "_partial_": True, "first": [call]}
+        with pytest.raises(ConfigError):
+            run_folder.checked_config(tmp_path)
+        cfg[key] = before
 
 
 @pytest.fixture

@@ -1,24 +1,27 @@
 """Files of data sets, as several tests of this folder compare them."""
 
-import json
+from collections.abc import Callable
 from pathlib import Path
+
+from safetensors.torch import load_file, save
 
 from dpl.data import Store
 from dpl.data.storage.integrity import verify
-
-
-def lines(store: Store) -> list[dict]:
-    """Return the lines of the manifest."""
-    return [json.loads(line) for line in (store.folder / "manifest.jsonl").read_text().splitlines()]
+from dpl.data.storage.shard import Columns, digest
 
 
 def content(folder: Path) -> dict[str, bytes]:
     """Return all that must not depend on how the data set was made, byte for byte."""
-    return {
-        p.name: p.read_bytes() for p in [*folder.glob("*.safetensors"), *folder.glob("m*.jsonl")]
-    }
+    return {path.name: path.read_bytes() for path in folder.glob("*.safetensors")}
 
 
 def flaws(store: Store) -> dict[str, str]:
     """Return the damaged files with what is wrong."""
-    return {part.file: flaw for part, flaw in verify(store) if flaw}
+    return {path.name: flaw for path, flaw in verify(store) if flaw}
+
+
+def falsify(path: Path, change: Callable[[Columns], object]) -> None:
+    """Change the columns of a shard and its digest, as an intruder would."""
+    columns = load_file(path)
+    change(columns)
+    path.write_bytes(save(columns, {"sha256": digest(path.name, columns)}))

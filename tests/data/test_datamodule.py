@@ -123,17 +123,6 @@ def test_a_batch_is_a_copy(offline):
     assert torch.equal(module.samples("train").force, before)
 
 
-def test_the_plan_counts_what_is_there(offline, scene, folder, tmp_path):
-    where, line = offline().skipped_work()
-    assert str(folder) in where
-    assert scene.fingerprint[:12] in where
-    assert line.startswith("20 of 20 loads not solved again")
-    assert offline(train=30).skipped_work()[1].startswith("20 of 38 loads not solved again")
-    (where,) = DataModule(scene, folder=str(tmp_path / "new"), workers=0).skipped_work()
-    assert str(tmp_path / "new") in where
-    assert not (tmp_path / "new").exists(), "a plan computes nothing and writes nothing"
-
-
 def test_preparing_twice_solves_nothing(offline, folder, monkeypatch):
     def written():
         return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -145,24 +134,6 @@ def test_preparing_twice_solves_nothing(offline, folder, monkeypatch):
     module.prepare_data()
     assert solved == []
     assert written() == before != {}
-
-
-# ------------------------------------------------------------------ young: one data set for all
-
-
-def test_the_moduli_are_those_of_the_scene_that_reads_the_data_set(
-    scene, make_scene, offline, folder
-):
-    """u/L depends on f/(E L^2) only, so a data set is valid for every modulus and size."""
-    wide = make_scene(young=[1e6, 2e11], size=(1.0, 0.25, 0.25))
-    module = DataModule(wide, folder=str(folder), train=12, **SIZES)
-    here, there = offline().samples("train"), module.samples("train")
-    assert torch.equal(here.force, there.force)
-    assert torch.equal(here.displacement, there.displacement)
-    assert (here.young == 4500.0).all()
-    assert torch.equal(there.young, wide.loads.sample((0, 0), range(12)).young)
-    assert len(there.young.unique()) == 12
-    assert torch.equal(next(iter(module.val_dataloader())).young, module.samples("val").young)
 
 
 # ------------------------------------------------------------------ symmetry

@@ -2,15 +2,13 @@
 
 import json
 import os
-import shutil
 import signal
 
 import pytest
 from set_files import content
 
-from dpl.data import DataSet
+from dpl.data import DataSet, Store
 from dpl.data.solving.solve import failed_load, solve_load
-from dpl.data.storage.pending import PendingLoads
 from dpl.fem import SaintVenantKirchhoff
 
 SIZES = {"train": 6, "val": 2, "test": 2}
@@ -45,18 +43,17 @@ def interrupted(monkeypatch):
 
     def interrupted(after, *signals):
         count = 0
-        real = PendingLoads.write
+        real = Store.write
 
         def keep(self, one):
             nonlocal count
             count += 1
-            path = real(self, one)
+            real(self, one)
             if count == after:
                 for number in signals:
                     os.kill(os.getpid(), number)
-            return path
 
-        monkeypatch.setattr(PendingLoads, "write", keep)
+        monkeypatch.setattr(Store, "write", keep)
 
     return interrupted
 
@@ -100,16 +97,6 @@ def test_progress_shows_accepted_rejected_and_samples_a_second(wanted, capsys):
     assert "/s" in out
 
 
-def test_progress_counts_wanted_pending_loads_only(wanted, interrupted, solved, capsys):
-    interrupted(4, signal.SIGINT, signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        wanted().fill()
-    capsys.readouterr()
-    wanted(train=2).fill()
-    assert len(solved) == 4 + 4
-    assert "6/6" in capsys.readouterr().out
-
-
 def test_the_journal_has_a_line_for_each_session_that_solved_something(wanted, capsys):
     store = wanted(val=0, test=0).fill()
     wanted(val=0, test=0).fill()
@@ -149,7 +136,7 @@ def test_after_one_signal_the_solve_in_progress_is_finished(wanted, interrupted,
     if raised is SystemExit:
         assert end.value.code == 143
     store = wanted().store
-    assert len(store.pending.files()) == 3
+    assert len(store.tried("train")) == 3
     assert sessions(store)[0]["loads"] == 3
 
 
@@ -168,7 +155,6 @@ def test_a_set_interrupted_by_two_signals_has_the_bytes_of_an_uninterrupted_one(
     wanted().fill()
     assert len(set(solved)) == len(solved) == 10, "no load is solved twice"
     assert content(wanted().store.folder) == content(at_once.folder)
-    assert not (wanted().store.folder / "pending").exists()
     assert sum(one["loads"] for one in sessions(wanted().store)) in (9, 10)
 
 
@@ -200,45 +186,6 @@ def test_a_biased_set_gives_a_warning_of_one_line(wanted, monkeypatch, capsys):
     assert all(part.accepted == part.tried for part in store.acceptance() if part.high < 0.1)
 
 
-# ------------------------------------------------------------------ verify and repair
-
-
-@pytest.fixture
-def made(wanted):
-    return wanted().fill()
-
-
-def test_verify_names_each_damaged_file(made, wanted):
-    assert list(wanted().verify()) == []
-    path = made.folder / "val-000000.safetensors"
-    path.write_bytes(path.read_bytes()[:-1])
-    (made.folder / "test-000000.safetensors").unlink()
-    first, second = wanted().verify()
-    assert first.startswith(f"{path} is damaged")
-    assert second == f"{made.folder / 'test-000000.safetensors'} is missing"
-
-
-def test_repair_makes_damaged_files_again(made, wanted, solved, capsys):
-    before = content(made.folder)
-    (made.folder / "val-000000.safetensors").write_bytes(b"")
-    capsys.readouterr()
-    wanted().repair()
-    reported = capsys.readouterr().out
-    assert "val-000000.safetensors is damaged" in reported
-    assert "; it is removed, and its 2 loads are solved again" in reported
-    assert solved == [(1, 0), (1, 1)]
-    after = content(made.folder)
-    manifests = [sorted(found.pop("manifest.jsonl").splitlines()) for found in (after, before)]
-    assert manifests[0] == manifests[1]
-    assert after == before
-    assert list(wanted().verify()) == []
-    shutil.rmtree(made.folder)
-    wanted().repair()
-    whole = content(made.folder)
-    assert sorted(whole.pop("manifest.jsonl").splitlines()) == manifests[1]
-    assert whole == before, "a missing set is made"
-
-
 # ------------------------------------------------------------------ the command
 
 
@@ -246,6 +193,9 @@ def test_the_command_verifies_and_repairs_a_set(script, tiny, tmp_path):
     sizes = [*tiny, "data.train=4", "data.val=1", "data.test=1", "data.workers=0", "data.folder=d"]
     assert script("generate", *sizes, cwd=tmp_path).status == 0
     before = content(tmp_path / "d")
+    again = script("generate", *sizes, cwd=tmp_path)
+    assert "train: 4 of 4 loads accepted" in again.out
+    assert "solving" not in again.out
     sound = script("generate", *sizes, "action=verify", cwd=tmp_path)
     assert sound.status == 0
     assert "0 flaws found" in sound.out

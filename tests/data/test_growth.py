@@ -5,12 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from set_files import content
 
 from dpl.data import DataModule, DataSet, Growing, background, growing
 from dpl.data.background import BackgroundSolver
-from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.data.storage import store as store_module
-from dpl.data.storage.store import Store
 from dpl.system.files import DataSetError, exclusive_lock
 
 BLOCK = 4
@@ -159,12 +158,14 @@ def test_a_worker_solves_in_the_background(scene, tmp_path):
     solver = BackgroundSolver(data, [("val", range(2)), ("train", range(6))])
     solver.wait({"train": 3, "val": 2})
     assert solver.count("train") >= 3
-    assert len(data.store.load("train", 3).force) == 3, "pending loads and shards"
+    assert len(data.store.load("train", 3).force) == 3, "also loads whose files are not merged"
     solver.wait({"train": 9})
     assert solver.count("train") == 6, "a wait ends with the loads"
     solver.close()
     assert multiprocessing.active_children() == before
     assert len(data.store.load("train", 6).force) == 6
+    alone = DataSet(scene, str(tmp_path / "e"), train=6, val=2, test=0, workers=0).fill()
+    assert content(data.store.folder) == content(alone.folder), "bytes do not depend on workers"
 
 
 def test_a_closed_solver_starts_no_load(scene, tmp_path):
@@ -194,15 +195,3 @@ def test_a_wait_ends_at_its_time(scene, tmp_path, monkeypatch):
     solver.wait({"train": 6}, until=2.0)
     assert solver.count("train") == 2
     solver.close()
-
-
-def test_pending_loads_are_samples(scene, tmp_path):
-    store = Store(tmp_path / "d", scene, 0)
-    data = DataSet(scene, str(store.folder), train=5, val=0, test=0, workers=0)
-    data.fill()
-    for number in (5, 7):
-        store.pending.write(solve_load(scene, LoadKey((0, 0), number)))
-    assert len(store.load("train", 8).force) == 7
-    expected = scene.loads.sample((0, 0), [4, 5, 7]).force
-    assert torch.equal(store.load("train", 8, first=4).force, expected)
-    assert store.tried("train") == {0, 1, 2, 3, 4, 5, 7}

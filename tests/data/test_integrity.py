@@ -1,47 +1,81 @@
 """Laws of `verify` and `repair`: every flaw of a data set is found and repaired."""
 
-import hashlib
-import json
+import os
 import shutil
+from functools import partial
 
 import pytest
 import torch
 from safetensors.torch import load_file, save
-from set_files import content, flaws, lines
+from set_files import content, falsify, flaws
 
-from dpl.data import DataSet
+from dpl.data import DataSet, DataSetError
 from dpl.data.storage.integrity import check_modes, repair
 
 SIZES = {"train": 12, "val": 4, "test": 4}
+FIRST = "train-000000.safetensors"
 
 
 def wanted(store, **sizes):
     return DataSet(store.scene, str(store.folder), **{**SIZES, **sizes}, workers=0)
 
 
-def write(store, found):
-    text = "".join(line if isinstance(line, str) else json.dumps(line) + "\n" for line in found)
-    (store.folder / "manifest.jsonl").write_text(text)
+def harm_of(column, change, which=...):
+    """Return a function that changes some values of a column."""
+
+    def harm(columns):
+        columns[column][which] = change(columns[column][which])
+
+    return harm
 
 
-# ------------------------------------------------------------------ flaws
+def last(columns, column, factor):
+    values = columns[column].view(-1)
+    values[int(values.nonzero()[-1])] *= factor  # of the last load
 
 
-@pytest.mark.parametrize(("split", "size"), [("train", 12), ("val", 4)])
-def test_verify_finds_a_shard_whose_line_is_lost(copy, data, split, size, capsys):
-    write(copy, [line for line in lines(copy) if line["split"] != split])
-    assert list(wanted(copy).verify()) == [
-        f"{copy.folder}/{split}-000000.safetensors is named by no manifest",
-        f"{copy.folder} lacks {size} of the loads that data.{split} = {size} requires; "
-        "the first is load 0",
-    ]
-    capsys.readouterr()
-    wanted(copy, **{split: 2}).repair()  # also the loads that are not wanted
-    reported = capsys.readouterr().out
-    assert "is named by no manifest; it is removed, and its" in reported
-    assert f"{size} loads of {split} are missing and are solved" in reported
+HARMS = {
+    "out of balance": harm_of("displacement", lambda u: u * (1.0 + 1e-5), (1, slice(20, 30))),
+    "inverted": harm_of("displacement", lambda u: -30.0 * u, 0),
+    "another load": harm_of("nodal_force", lambda f: 0.5 * f),
+    "another order": harm_of("displacement", lambda u: u.flip(0)),
+    "another point": harm_of("point", lambda _: 0.25, (..., -1)),
+    "a load out of balance": partial(last, column="displacement", factor=1 + 1e-4),
+    "a force": partial(last, column="nodal_force", factor=1 - 1e-4),
+    "a point": partial(last, column="point", factor=1 + 1e-9),
+}
+WHY = {
+    "another load": "holds loads that this scene does not draw",
+    "a force": "holds loads that this scene does not draw",
+    "another point": "holds other loads than its seed draws",
+    "a point": "holds other loads than its seed draws",
+    "a load out of balance": "holds a displacement that is not in equilibrium: load 11",
+}
+
+
+@pytest.mark.parametrize("harm", HARMS)
+def test_verify_finds_wrong_numbers_under_a_right_digest(data, copy, harm):
+    falsify(copy.folder / FIRST, HARMS[harm])
+    found = flaws(copy)
+    assert list(found) == [FIRST]
+    assert found[FIRST].startswith(WHY.get(harm, "holds a displacement that is not in equilibrium"))
+    wanted(copy).repair()
     assert content(copy.folder) == content(data.store.folder)
-    assert list(wanted(copy).verify()) == []
+
+
+def test_verify_finds_a_displacement_with_det_F_of_zero(copy, monkeypatch):
+    """Also if the displacement is in equilibrium."""
+    body = type(copy.scene.problem)
+    monkeypatch.setattr(body, "is_equilibrium", lambda *_: torch.tensor(True))
+    assert flaws(copy) == {}
+    genuine = body.evaluate
+
+    def flat(self, u):
+        internal, volume = genuine(self, u)
+        return internal, 0 * volume
+
+    monkeypatch.setattr(body, "evaluate", flat)
+    assert flaws(copy)[FIRST] == "holds a displacement that is not in equilibrium: load 0"
 
 
 @pytest.mark.parametrize(
@@ -51,7 +85,6 @@ def test_verify_finds_a_shard_whose_line_is_lost(copy, data, split, size, capsys
             {"train": 13},
             ["lacks 1 of the loads that data.train = 13 requires; the first is load 12"],
         ),
-        ({"val": 9}, ["lacks 5 of the loads that data.val = 9 requires; the first is load 4"]),
         ({"train": 14, "test": 5}, ["data.train = 14", "data.test = 5"]),
         ({"train": 3, "val": 0}, []),
     ],
@@ -69,76 +102,54 @@ def test_verify_of_a_part_ignores_the_loads_of_other_parts(copy, monkeypatch):
     assert [line.split()[1:3] for line in found[1]] == [["lacks", "12"]]
 
 
-TORN = {
-    "torn": (lambda line: json.dumps(line)[:40] + "\n", "is not a JSON object"),
-    "no object": (lambda line: "[1, 2]\n", "is not a JSON object"),
-    "empty": (lambda line: "\n", "is not a JSON object"),
-    "lacking": (lambda line: {"file": line["file"]}, "lacks accepted, amplitudes"),
-    "elsewhere": (lambda line: line | {"file": "/dev/zero"}, "not in the folder of the data set"),
-}
-
-
-@pytest.mark.parametrize(("harm", "why"), TORN.values(), ids=TORN)
-def test_verify_finds_an_invalid_line_with_its_number(copy, data, harm, why):
-    found, which = lines(copy), 2
-    name = found[which]["file"]
-    found[which] = harm(found[which])
-    write(copy, found)
-    reported = flaws(copy)
-    assert sorted(reported) == sorted(["manifest.jsonl", name])
-    assert reported["manifest.jsonl"].startswith(
-        f"has 1 lines that describe no shard; the first is line {which + 1}, which "
-    )
-    assert why in reported["manifest.jsonl"]
-    assert reported[name] == "is named by no manifest"
-    done = {part.file: words for part, words in repair(copy)}
-    assert done["manifest.jsonl"].endswith("; these lines are removed")
+def test_repair_names_each_damaged_file_and_solves_only_its_loads(copy, data, capsys):
+    path = copy.folder / "val-000000.safetensors"
+    path.write_bytes(path.read_bytes()[:-1])
+    (copy.folder / "test-000000.safetensors").unlink()
+    first, *missing = wanted(copy).verify()
+    assert first.startswith(f"{path} is damaged")
+    assert [line.partition(" lacks ")[2].partition(";")[0] for line in missing] == [
+        f"4 of the loads that data.{split} = 4 requires" for split in ("val", "test")
+    ]
+    capsys.readouterr()
     wanted(copy).repair()
+    reported = capsys.readouterr().out
+    assert f"{path} is damaged" in reported
+    assert "; it is removed" in reported
+    assert "4 loads of val are missing and are solved" in reported
+    assert "8/8" in reported
+    assert content(copy.folder) == content(data.store.folder)
+    shutil.rmtree(copy.folder)
+    wanted(copy).repair()
+    assert content(copy.folder) == content(data.store.folder), "a missing set is made"
+
+
+def test_repair_also_solves_damaged_loads_beyond_the_sizes_wanted(copy, data):
+    falsify(copy.folder / "val-000000.safetensors", harm_of("displacement", lambda u: 2 * u))
+    wanted(copy, val=2).repair()
     assert content(copy.folder) == content(data.store.folder)
 
 
-def test_invalid_lines_are_counted_for_each_manifest(copy):
-    with (copy.folder / "manifest.jsonl").open("a") as file:
-        file.write("{\n{}\n")
-    (copy.folder / "manifest-1-of-2.jsonl").write_text("torn")
-    reported = flaws(copy)
-    assert reported["manifest.jsonl"].startswith("has 2 lines")
-    assert "the first is line 4" in reported["manifest.jsonl"]
-    assert reported["manifest-1-of-2.jsonl"].startswith("has 1 lines")
-    repair(copy)
-    assert flaws(copy) == {}
-
-
-@pytest.mark.parametrize("name", ["../outside.safetensors", "sub/outside.safetensors", "sub/../x"])
-def test_verify_finds_a_line_that_names_a_file_outside_and_repair_leaves_the_file(copy, data, name):
-    found = lines(copy)
-    genuine = copy.folder / found[0]["file"]
-    (copy.folder / "sub").mkdir()
-    outside = copy.folder / name
-    genuine.rename(outside)
-    found[0]["file"] = name
-    write(copy, found)
-    assert flaws(copy) == {name: "is not in the folder of the data set and is not read"}
-    wanted(copy).repair()
-    assert outside.exists()
-    assert content(copy.folder)[genuine.name] == genuine.read_bytes()
-    assert copy.digest("train", 12) == data.store.digest("train", 12)
-    assert list(wanted(copy).verify()) == []
-
-
-@pytest.mark.parametrize("harm", ["a copy", "no shard", "a link", "larger than any shard"])
-def test_a_shard_that_no_manifest_names_is_found_and_removed(copy, data, harm):
-    stray = copy.folder / "train-000064.safetensors"
-    if harm == "a copy":
-        shutil.copy(copy.folder / "train-000000.safetensors", stray)
+@pytest.mark.parametrize("harm", ["a copy", "no shard", "a link", "larger than any shard", "mine"])
+def test_a_file_that_is_no_shard_of_its_name_is_found_and_removed(copy, data, harm):
+    name = "mine" if harm == "mine" else "train-000064"
+    stray = copy.folder / f"{name}.safetensors"
+    if harm in ("a copy", "mine"):
+        shutil.copy(copy.folder / FIRST, stray)
     elif harm == "a link":
-        stray.symlink_to(copy.folder / "train-000000.safetensors")
+        stray.symlink_to(copy.folder / FIRST)
     else:
         stray.write_bytes(b"nothing" if harm == "no shard" else bytes(copy.max_shard_size(64) + 1))
-    assert flaws(copy) == {stray.name: "is named by no manifest"}
-    ((part, reported),) = repair(copy)
-    assert (part.file, list(part.loads)) == (stray.name, []), "none of its loads is of its name"
-    assert reported == "is named by no manifest; it is removed"
+    (copy.folder / ".val-000004.safetensors.99.part").write_bytes(b"half a shard")
+    (copy.folder / "notes.txt").write_text("mine")
+    assert copy.missing("train", 70) == list(range(12, 70))
+    assert len(copy.load("train", 70).force) == 12
+    assert list(flaws(copy)) == [stray.name]
+    ((path, reported),) = repair(copy)
+    assert path == stray
+    assert reported.endswith("; it is removed")
+    assert (copy.folder / "notes.txt").exists()
+    assert not list(copy.folder.glob(".*.part"))
     assert content(copy.folder) == content(data.store.folder)
 
 
@@ -152,84 +163,55 @@ def test_an_empty_folder_with_the_name_of_a_shard_is_removed_and_a_full_one_left
     assert (full / "mine").is_file()
 
 
-def flip_lowest_bit(path, column):
-    """Flip the lowest bit of the mantissa of the last number of a column that is not 0."""
-    whole = bytearray(path.read_bytes())
-    length = int.from_bytes(whole[:8], "little")
-    first, last = json.loads(whole[8 : 8 + length])[column]["data_offsets"]
-    places = range(8 + length + first, 8 + length + last, 8)
-    place = next(k for k in reversed(places) if any(whole[k : k + 8]))
-    whole[place] ^= 1
-    path.write_bytes(whole)
-
-
 @pytest.mark.parametrize("column", ["displacement", "nodal_force", "iterations"])
-def test_verify_finds_a_flipped_bit_that_only_the_digest_detects(copy, column):
+def test_a_flipped_bit_that_only_the_digest_detects_is_found(copy, column):
     """Equilibrium, loads and shapes stay within their tolerances."""
-    path = copy.folder / "train-000000.safetensors"
-    before = load_file(path)[column].clone()
-    flip_lowest_bit(path, column)
-    after = load_file(path)[column]
-    assert (before != after).sum() == 1
+    path = copy.folder / FIRST
+    columns = load_file(path)
+    values = columns[column].clone().view(torch.int64).view(-1)
+    values[int(values.nonzero()[-1])] ^= 1
+    after = values.view(columns[column].dtype).view_as(columns[column])
     if after.is_floating_point():
-        assert torch.allclose(before, after, rtol=1e-15, atol=0)
-    assert flaws(copy) == {path.name: "is damaged: its SHA-256 differs from the manifest's"}
-    with pytest.raises(ValueError, match="SHA-256"):
+        assert torch.allclose(columns[column], after, rtol=1e-15, atol=0)
+    content = path.read_bytes()
+    before, changed = (c.numpy().tobytes() for c in (columns[column], after))
+    assert content.count(before) == 1
+    path.write_bytes(content.replace(before, changed))
+    why = "is damaged: the SHA-256 of its name and its columns is wrong"
+    assert flaws(copy) == {path.name: why}
+    with pytest.raises(DataSetError, match=f"{FIRST} {why}; .*action=repair"):
         copy.load("train", 12)
-    found = lines(copy)
-    found[0]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-    write(copy, found)
+    falsify(path, lambda columns: None)
     assert flaws(copy) == {}, "no other check can tell"
 
 
-# ------------------------------------------------------------------ tolerances
-
-
-def harmed(store, change):
-    """Change the columns and the digest of the first shard; return its flaw."""
-    found = lines(store)
-    path = store.folder / found[0]["file"]
-    shard = load_file(path)
-    change(shard)
-    path.write_bytes(save(shard))
-    found[0]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-    write(store, found)
-    return flaws(store).get(path.name, "")
-
-
 @pytest.mark.parametrize(
-    ("column", "error", "flaw"),
+    ("name", "harm"),
     [
-        ("point", 1e-9, "holds other loads than its seed draws"),
-        ("nodal_force", -1e-4, "holds loads that this scene does not draw"),
-        ("displacement", 1e-4, "holds a displacement that is not in equilibrium: load 11"),
+        *(("scene.json", harm) for harm in ("a link", "huge", "a folder")),
+        *(("modes.safetensors", harm) for harm in ("a folder", "a link", "huge")),
+        *((FIRST, harm) for harm in ("a pipe", "a loop", "huge", "a link", "a folder")),
     ],
 )
-def test_verify_finds_a_small_error_in_a_number_of_one_load(copy, column, error, flaw):
-    def change(shard):
-        values = shard[column].view(-1)
-        place = int(values.nonzero()[-1])  # of the last load
-        values[place] *= 1 + error
-
-    assert harmed(copy, change) == flaw
-
-
-def test_verify_finds_a_displacement_with_det_F_of_zero(copy, monkeypatch):
-    """Also if the displacement is in equilibrium."""
-    body = type(copy.scene.problem)
-    monkeypatch.setattr(body, "is_equilibrium", lambda *_: torch.tensor(True))
-    assert flaws(copy) == {}
-    genuine = body.evaluate
-
-    def flat(self, u):
-        internal, volume = genuine(self, u)
-        return internal, 0 * volume
-
-    monkeypatch.setattr(body, "evaluate", flat)
-    assert (
-        flaws(copy)["train-000000.safetensors"]
-        == "holds a displacement that is not in equilibrium: load 0"
-    )
+def test_irregular_files_are_not_read(copy, tmp_path, name, harm):
+    path = copy.folder / name
+    if harm == "huge":
+        os.truncate(path, 2**40)
+    else:
+        path.rename(tmp_path / "outside")
+    if harm in ("a link", "a loop"):
+        path.symlink_to(tmp_path / "outside" if harm == "a link" else path.name)
+    elif harm == "a folder":
+        path.mkdir()
+    elif harm == "a pipe":
+        os.mkfifo(path)
+    if name == FIRST:
+        assert copy.missing("train", 12) == list(range(12))
+        assert "regular" in flaws(copy)[name] or "larger" in flaws(copy)[name]
+        return
+    with pytest.raises(DataSetError, match=name) as refusal:
+        copy.modes() if name == "modes.safetensors" else copy.load("train", 12)
+    assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("which", ["values", "vectors"])
@@ -241,3 +223,9 @@ def test_modes_are_compared_to_six_digits_with_their_signs(scene, which):
         assert found == ("" if equal else "holds other modes than this scene has")
     fewer = {name: array[:-1] for name, array in modes.items()}
     assert check_modes(scene, fewer) == "holds other modes than this scene has"
+
+
+def test_modes_of_another_precision_are_found(copy):
+    path = copy.folder / "modes.safetensors"
+    path.write_bytes(save({name: column.float() for name, column in load_file(path).items()}))
+    assert list(flaws(copy)) == ["modes.safetensors"]

@@ -2,7 +2,6 @@
 
 import functools
 import hashlib
-import json
 import shutil
 from collections import Counter
 from contextlib import contextmanager, suppress
@@ -16,7 +15,6 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_stat
 
 from dpl.data import DataSet, DataSetError, Store, dataset
 from dpl.data.solving.solve import failed_load, solve_load
-from dpl.data.storage import pending
 from dpl.data.storage import store as store_module
 from dpl.data.storage.integrity import MACHINE_FAILURES
 
@@ -30,38 +28,28 @@ class Killed(BaseException):
 
 @contextmanager
 def killed_after(operations):
-    """Let no file be renamed, removed or appended to after a number of such operations."""
+    """Let no file be renamed or removed after a number of such operations."""
     left = operations
 
-    def dying(original, torn=None):
+    def dying(original):
         def call(*arguments, **options):
             nonlocal left
             if left <= 0:
-                if torn is not None and left == 0:
-                    torn(*arguments)
-                left = -1
                 raise Killed
             left -= 1
             return original(*arguments, **options)
 
         return call
 
-    def half_a_line(path, line):
-        with path.open("a") as file:
-            file.write(json.dumps(line)[:40])
-
     with pytest.MonkeyPatch.context() as patch, suppress(Killed):
         patch.setattr("dpl.system.files.os.replace", dying(shutil.move))
         patch.setattr(Path, "unlink", dying(Path.unlink))
-        patch.setattr(dataset, "append_jsonl", dying(dataset.append_jsonl, half_a_line))
         yield
 
 
 def files(folder):
-    """Return the SHA-256 of the shards and the modes, and the lines of all manifests."""
-    digests = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.glob("*.saf*")}
-    manifests = "".join(path.read_text() for path in folder.glob("manifest*.jsonl"))
-    return digests, sorted(set(manifests.splitlines()))
+    """Return the SHA-256 of the shards and the modes."""
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.glob("*.saf*")}
 
 
 class Life(RuleBasedStateMachine):
@@ -131,8 +119,7 @@ class Life(RuleBasedStateMachine):
         place=st.floats(0, 1, exclude_max=True),
     )
     def a_file_is_damaged(self, which, how, place):
-        names = ("*.safetensors", "manifest*", "pending/*.load")
-        found = sorted(path for name in names for path in self.folder.glob(name))
+        found = sorted(self.folder.glob("*.safetensors"))
         if not found:
             return
         self.is_sound, self.lost_work = False, True
@@ -173,7 +160,6 @@ class Life(RuleBasedStateMachine):
         assert files(self.folder) == files(self.whole.folder)
         assert list(self.writer().verify()) == []
         assert not list(self.folder.rglob("*.part"))
-        assert not list(self.folder.rglob("*.load"))
 
     def teardown(self):
         try:
@@ -195,7 +181,7 @@ def solve_once(scene, job):
 
 def test_every_life_ends_with_the_bytes_of_one_run(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(store_module, "SHARD_SIZE", 3)
-    monkeypatch.setattr(pending, "PARTIAL_FILE_AGE", -1.0)
+    monkeypatch.setattr(dataset, "PARTIAL_FILE_AGE", -1.0)
     whole = DataSet(scene, str(tmp_path / "whole"), **SIZES, workers=0).fill()
     options = settings(max_examples=12, stateful_step_count=8, deadline=None)
     run_state_machine_as_test(lambda: Life(whole, tmp_path / "d"), settings=options)

@@ -1,18 +1,24 @@
 """Laws of shards: decoded loads equal encoded ones, and damaged shards are refused."""
 
-import hashlib
-
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load, save
+from safetensors.torch import load_file, save
+from set_files import falsify
 
 from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.storage import store as store_module
-from dpl.data.storage.manifest import entry_of_load, merge_entries
-from dpl.data.storage.pending import DIGEST_SIZE, PendingLoads
-from dpl.data.storage.shard import concatenate, decode_shard, encode_load, to_dense
-from dpl.data.storage.store import runs
+from dpl.data.storage.shard import (
+    DESCRIPTION,
+    encode_load,
+    encode_shard,
+    read_description,
+    read_shard,
+    reasons,
+    single_loads,
+    to_dense,
+    to_sparse,
+)
 
 SHAPE, DIMENSION = (4, 3), 2
 
@@ -31,161 +37,157 @@ def solved(number, *, nodes=(0, 3), accepted=True):
         accepted=accepted,
         residual=1e-9 * number,
         volume_ratio=0.25 + number,
-        load_factor=1.0,
+        load_factor=1.0 if accepted else 0.25,
         iterations=3 + number,
         seconds=0.0,
         reason="" if accepted else "diverged",
     )
 
 
-def content(*loads, n_parameters=0):
-    """Return a shard; the parameters are the last coordinates of the points."""
+def encoded(*loads, n_parameters=0):
+    """Return the columns of loads; the parameters are the last coordinates of the points."""
     ratio = lambda one: torch.from_numpy(one.point)[None, DIMENSION - n_parameters :]  # noqa: E731
-    return save(concatenate([encode_load(one, ratio(one)) for one in loads]))
+    return [encode_load(one, ratio(one)) for one in loads]
 
 
-def same(columns, one):
-    """Return True if the columns are those of a single load, and equal to it."""
-    names = ("point", "displacement", "residual", "volume_ratio", "iterations")
-    return (
-        columns["index"].tolist() == [one.job.number]
-        and np.array_equal(to_dense(columns, SHAPE)[0], one.force)
-        and all(np.array_equal(columns[name][0], getattr(one, name)) for name in names)
-    )
+@pytest.fixture
+def write(tmp_path):
+    """Return a function that writes a shard of some loads and returns its path."""
+
+    def write(*loads, **options):
+        path = tmp_path / "val-000005.safetensors"
+        path.write_bytes(encode_shard(path.name, encoded(*loads, **options)))
+        return path
+
+    return write
 
 
-def line(*loads):
-    return merge_entries([entry_of_load("val", one) for one in loads])
-
-
-def test_a_decoded_load_equals_the_encoded_one():
-    loads = [solved(5), solved(6, nodes=(0, 1, 2, 3)), solved(7, nodes=())]
-    for one in loads:
-        assert same(decode_shard(content(one), SHAPE, DIMENSION), one)
-    shard = decode_shard(content(*loads), SHAPE, DIMENSION)
-    assert np.array_equal(to_dense(shard, SHAPE), np.stack([one.force for one in loads]))
+def test_a_shard_holds_its_loads(write):
+    loads = [solved(5), solved(6, nodes=()), solved(7, accepted=False), solved(9, nodes=(1,))]
+    shard = read_shard(write(*loads), SHAPE, DIMENSION)
+    kept = [one for one in loads if one.accepted]
+    assert shard["tried"].tolist() == [5, 6, 7, 9]
+    assert shard["index"].tolist() == [5, 6, 9]
+    assert shard["amplitude"].tolist() == [one.amplitude for one in loads]
+    assert shard["iterations"].tolist() == [one.iterations for one in loads]
+    assert shard["load_factor"].tolist() == [1.0, 1.0, 0.25, 1.0]
+    assert reasons(shard) == ["diverged"]
+    for name in ("displacement", "point", "residual", "volume_ratio"):
+        assert np.array_equal(shard[name], np.stack([getattr(one, name) for one in kept]))
+    assert np.array_equal(to_dense(shard, SHAPE), np.stack([one.force for one in kept]))
     assert shard["parameters"].shape == (3, 0)
-    assert shard["iterations"].tolist() == [8, 9, 10]
 
 
-def test_a_rejected_load_has_no_rows_and_a_reason_in_the_manifest():
-    loads = [solved(5), solved(6, accepted=False), solved(7)]
-    shard = decode_shard(content(*loads), SHAPE, DIMENSION)
-    assert shard["index"].tolist() == [5, 7]
-    assert np.array_equal(to_dense(shard, SHAPE)[1], loads[2].force)
-    rejected = {"index": 6, "reason": "diverged", "load_factor": 1.0}
-    assert line(*loads)["rejected"] == [rejected]
+def test_the_description_is_a_part_of_the_columns(write):
+    path = write(solved(5), solved(6, accepted=False))
+    whole, part = read_shard(path, SHAPE, DIMENSION), read_description(path)
+    assert set(part) == set(DESCRIPTION)
+    assert all(torch.equal(part[name], whole[name]) for name in part)
 
 
-def test_parameters_are_kept_where_loads_have_their_own():
+def test_loads_that_are_taken_apart_and_merged_give_the_same_bytes(write):
+    path = write(solved(5), solved(6, nodes=()), solved(7, accepted=False), solved(8))
+    loads = single_loads(read_shard(path, SHAPE, DIMENSION))
+    assert list(loads) == [5, 6, 7, 8]
+    assert encode_shard(path.name, loads.values()) == path.read_bytes()
+    alone = encode_shard(path.name, encoded(solved(8)))
+    assert encode_shard(path.name, [loads[8]]) == alone
+
+
+def test_parameters_are_kept_where_loads_have_their_own(write):
     loads = [solved(5), solved(6)]
-    whole = content(*loads, n_parameters=1)
     points = torch.from_numpy(np.stack([one.point for one in loads]))
-    assert torch.equal(decode_shard(whole, SHAPE, DIMENSION, 1)["parameters"], points[:, -1:])
+    path = write(*loads, n_parameters=1)
+    assert torch.equal(read_shard(path, SHAPE, DIMENSION, 1)["parameters"], points[:, -1:])
     with pytest.raises(ValueError, match="parameters has shape"):
-        decode_shard(whole, SHAPE, DIMENSION, 0)
-    with pytest.raises(ValueError, match="parameters has shape"):
-        decode_shard(content(*loads), SHAPE, DIMENSION, 1)
+        read_shard(path, SHAPE, DIMENSION, 0)
 
 
-def test_a_pending_load_is_a_shard_of_one_load_with_its_line_of_the_manifest(tmp_path):
-    pending = PendingLoads(tmp_path / "pending", {"val": (7, 1)}, lambda points: points[:, 2:])
-    for one in (solved(3), solved(4, nodes=())):
-        entry, columns = pending.read(pending.write(one))
-        assert same(columns, one)
-        assert entry == line(one)
-        assert save(columns) == content(one)
-    rejected = solved(5, accepted=False)
-    entry, columns = pending.read(pending.write(rejected))
-    assert entry == line(rejected)
-    assert not any(len(column) for column in columns.values())
-    assert list(pending.files()) == [LoadKey((7, 1), k) for k in (3, 4, 5)]
+@pytest.mark.parametrize("shape", [(7, 3), (5, 2)])
+def test_forces_are_restored_from_their_sparse_form(shape):
+    generator = torch.Generator().manual_seed(0)
+    force = torch.randn(6, *shape, generator=generator, dtype=torch.float64)
+    force[torch.rand(6, shape[0], generator=generator) < 0.6] = 0.0
+    force[0, 2], force[0, 2, 1] = 0.0, 1e-300  # one component of a node is a node that carries
+    force[3] = 0.0
+    packed = to_sparse(force)
+    assert torch.equal(to_dense(packed, shape), force)
+    assert len(packed["nodal_force"]) == len(packed["node"]) == packed["n_loaded_nodes"].sum()
+    assert packed["n_loaded_nodes"][3] == 0
+    assert packed["node"].dtype == torch.int32
+    assert packed["nodal_force"].abs().amax(dim=1).min() > 0, "nothing is stored of idle nodes"
 
 
-def test_a_pending_load_has_the_split_and_the_number_of_its_file(tmp_path):
-    """The line of JSON inside could name a path outside the data set."""
-    pending = PendingLoads(tmp_path / "pending", {"val": (7, 1)}, lambda points: points[:, 2:])
-    path = pending.write(solved(3))
-    content = path.read_bytes()[DIGEST_SIZE:].replace(b'"split": "val"', b'"split": "../val"')
-    content = content.replace(b'"first": 3', b'"first": 4')
-    path.write_bytes(hashlib.sha256(path.name.encode() + content).digest() + content)
-    assert list(pending.files().values()) == [path]
-    entry, _ = pending.read(path)
-    assert (entry["split"], entry["first"]) == ("val", 3)
+POSSIBLE = [
+    *(("node", [0, 1, 2, 3, 0, 3]), ("n_loaded_nodes", [4, 2]), ("n_loaded_nodes", [2, 4])),
+    *(("iterations", [0, 2**53 - 1]), ("amplitude", [0.0, 1e300]), ("tried", [5, 6])),
+]
+IMPOSSIBLE = [
+    *(("node", values, "node does not exist") for values in ([0, 1, 2, 3, 0, 4], [0, 1, 2, -1])),
+    *(("n_loaded_nodes", values, "loaded nodes") for values in ([5, 1], [7, -1], [6, 0])),
+    *(("n_loaded_nodes", values, "node has shape") for values in ([3, 2], [4, 3])),
+    *(("tried", values, "not ascending") for values in ([6, 5], [5, 5], [-1, 6], [5, 2**53])),
+    *(("tried", values, "was not tried") for values in ([5, 7], [4, 6])),
+    *(("index", values, "was not tried") for values in ([6, 5], [5, 5], [5, 7])),
+    *(("iterations", values, "out of range") for values in ([-1, 0], [0, 2**53])),
+    ("amplitude", [-1e-9, 1.0], "amplitude is negative"),
+    *((name, np.nan, "not finite") for name in ("amplitude", "point", "displacement")),
+    *((name, np.inf, "not finite") for name in ("nodal_force", "amplitude")),
+]
 
 
-def change(name, values):
-    columns = load(content(solved(5, nodes=(0, 1, 2, 3)), solved(6)))
-    columns[name] = torch.as_tensor(values, dtype=columns[name].dtype)
-    return save(columns)
+def change(columns, name, values):
+    column = columns[name]
+    if isinstance(values, float):
+        column.view(-1)[-1] = values
+    else:
+        columns[name] = torch.as_tensor(values, dtype=column.dtype)
 
 
-@pytest.mark.parametrize(
-    ("name", "values", "sound"),
-    [
-        *(("node", [0, 1, 2, 3, 0, 3], True), ("node", [0, 1, 2, 3, 0, 4], False)),
-        ("node", [0, 1, 2, 3, -1, 3], False),
-        *(
-            ("n_loaded_nodes", [4, 2], True),
-            ("n_loaded_nodes", [2, 4], True),
-            ("n_loaded_nodes", [5, 1], False),
-        ),
-        ("n_loaded_nodes", [7, -1], False),
-        *(
-            ("n_loaded_nodes", [6, 0], False),
-            ("n_loaded_nodes", [3, 2], False),
-            ("n_loaded_nodes", [4, 3], False),
-        ),
-    ],
-)
-def test_forces_on_nodes_that_do_not_exist_are_refused(name, values, sound):
-    if sound:
-        shard = decode_shard(change(name, values), SHAPE, DIMENSION)
-        assert to_dense(shard, SHAPE).shape == (2, *SHAPE)
-        return
-    with pytest.raises(ValueError, match="is damaged"):
-        decode_shard(change(name, values), SHAPE, DIMENSION)
+@pytest.mark.parametrize(("name", "values"), POSSIBLE)
+def test_possible_numbers_are_read(write, name, values):
+    path = write(solved(5, nodes=(0, 1, 2, 3)), solved(6))
+    falsify(path, lambda columns: change(columns, name, values))
+    assert to_dense(read_shard(path, SHAPE, DIMENSION), SHAPE).shape == (2, *SHAPE)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("point", np.nan), ("nodal_force", np.inf), ("displacement", -np.inf)],
-)
-def test_numbers_of_a_sample_that_are_not_finite_are_refused(name, value):
-    columns = load(content(solved(5)))
-    columns[name].view(-1)[-1] = value
-    with pytest.raises(ValueError, match=f"is damaged: {name} is not finite"):
-        decode_shard(save(columns), SHAPE, DIMENSION)
+@pytest.mark.parametrize(("name", "values", "why"), IMPOSSIBLE)
+def test_impossible_numbers_are_refused(write, name, values, why):
+    path = write(solved(5, nodes=(0, 1, 2, 3)), solved(6))
+    if name == "node" and len(values) == 4:
+        values = [*values, 0, 3]
+    falsify(path, lambda columns: change(columns, name, values))
+    with pytest.raises(ValueError, match=f"is damaged: .*{why}"):
+        read_shard(path, SHAPE, DIMENSION)
+    if name in DESCRIPTION:
+        with pytest.raises(ValueError, match=f"is damaged: .*{why}"):
+            read_description(path)
 
 
-@pytest.mark.parametrize("name", sorted(load(content(solved(5)))))
-def test_columns_of_wrong_shape_or_type_are_refused(name):
-    genuine = load(content(solved(5), solved(6)))
-    column = genuine[name]
+@pytest.mark.parametrize("name", sorted(encoded(solved(5))[0]))
+def test_columns_of_wrong_shape_or_type_are_refused(write, name):
+    path = write(solved(5), solved(6), solved(7, accepted=False))
+    column = load_file(path)[name]
     other = torch.int16 if column.dtype != torch.int64 else torch.int32
-    for wrong in (column[:-1].clone(), column[None].clone(), column.to(other)):
+    for wrong in (column[:-1].clone(), column[None].clone(), column.to(other), None):
+        write(solved(5), solved(6), solved(7, accepted=False))
+        if wrong is None:
+            kept = load_file(path)
+            del kept[name]
+            path.write_bytes(save(kept))
+        else:
+            falsify(path, lambda columns, wrong=wrong: columns.update({name: wrong}))
         with pytest.raises(ValueError, match="is damaged"):
-            decode_shard(save(genuine | {name: wrong}), SHAPE, DIMENSION)
-    with pytest.raises(ValueError, match="is damaged"):
-        decode_shard(
-            save({key: value for key, value in genuine.items() if key != name}), SHAPE, DIMENSION
-        )
+            read_shard(path, SHAPE, DIMENSION)
+
+
+def test_a_shard_under_the_name_of_another_is_refused(write, tmp_path):
+    other = write(solved(5)).rename(tmp_path / "val-000006.safetensors")
+    with pytest.raises(ValueError, match="SHA-256 of its name and its columns is wrong"):
+        read_shard(other, SHAPE, DIMENSION)
 
 
 # ------------------------------------------------------------------ shards of a store
-
-
-@pytest.mark.parametrize(
-    ("indices", "expected"),
-    [
-        ([], []),
-        ([0, 1, 2, 3, 4], [[0, 1, 2, 3], [4]]),
-        ([2, 3, 5, 8, 9, 10, 11, 12], [[2, 3], [5], [8, 9, 10, 11], [12]]),
-    ],
-)
-def test_a_file_holds_consecutive_loads_of_one_block(monkeypatch, indices, expected):
-    monkeypatch.setattr(store_module, "SHARD_SIZE", 4)
-    assert list(runs(indices)) == expected
 
 
 def test_writers_take_blocks_of_loads_in_turn(scene, tmp_path, monkeypatch):
@@ -203,7 +205,7 @@ def test_the_largest_shard_is_one_whose_loads_act_on_every_node(scene):
         *(np.ones((nodes, dim)), 1.0, True, 0.0, 1.0, 1.0, 1, 0.0, ""),
     )
     columns = encode_load(every, torch.zeros(1, 0))
-    sizes = [len(save(concatenate(count * [columns]))) for count in (1, 2)]
+    sizes = [len(encode_shard("name", count * [columns])) for count in (1, 2)]
     load_size = store.max_shard_size(2) - store.max_shard_size(1)
     assert sizes[1] - sizes[0] <= load_size <= 2 * (sizes[1] - sizes[0])
     assert store.max_shard_size(0) == store_module.HEADER

@@ -1,18 +1,14 @@
 """Laws of the data set on disk: the same bytes however it came about, nothing solved twice."""
 
-import hashlib
 import json
 import multiprocessing
 import os
-import shutil
 import subprocess
-from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file, save
-from set_files import content, flaws, lines
+from set_files import content, flaws
 
 from dpl import DataSetError
 from dpl.data import DataSet, Store, dataset
@@ -20,9 +16,7 @@ from dpl.data.solving import worker_pool
 from dpl.data.solving.solve import LoadKey, failed_load, solve_load
 from dpl.data.storage import store as store_module
 from dpl.data.storage.integrity import repair
-from dpl.data.storage.manifest import shard_name
-from dpl.data.storage.pending import PendingLoads
-from dpl.data.storage.shard import to_dense, to_sparse
+from dpl.data.storage.shard import reasons
 from dpl.fem import SaintVenantKirchhoff, rectangle
 from dpl.system.files import append_jsonl
 
@@ -73,23 +67,6 @@ def same(one, other):
     return all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-def rewrite(store, change, which=0):
-    """Change the tensors of a shard and write down its new digest, as an intruder would."""
-    manifest = store.folder / "manifest.jsonl"
-    found = lines(store)
-    path = store.folder / found[which]["file"]
-    shard = load_file(path)
-    changed = change(shard)
-    path.write_bytes(changed if isinstance(changed, bytes) else save(changed or shard))
-    found[which]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-    manifest.write_text("".join(json.dumps(line) + "\n" for line in found))
-    return path.name
-
-
-def mended(store):
-    return [part.file for part, _ in repair(store)]
-
-
 # ------------------------------------------------------------------ what is stored
 
 
@@ -121,21 +98,20 @@ def test_the_data_set_carries_modes_fingerprint_seed_and_versions(data, scene):
 def test_rejected_loads_are_recorded_with_reason_and_load_factor(hard, tmp_path):
     store = Store(tmp_path / "d", hard, 0)
     fill(store, {"train": range(6)})
-    (line,) = lines(store)
-    assert line["tried"] == len(line["amplitudes"]) == 6
-    assert line["rejected"], "SVK bears six loads of ten times L: choose harder ones"
-    assert line["accepted"] + len(line["rejected"]) == 6
-    for one in line["rejected"]:
-        assert one["reason"]
-        assert 0 <= one["load_factor"] < 1
-    rejected = {one["index"] for one in line["rejected"]}
-    shard = load_file(store.folder / line["file"])
-    assert set(shard["index"].tolist()) == set(range(6)) - rejected
-    if line["accepted"]:
-        assert len(store.load("train", 6).force) == line["accepted"]
-    assert f"{line['accepted']} of 6 loads accepted" in store.summary()
+    (shard,) = store.shards()
+    assert shard.tried == list(range(6))
+    rejected = ~shard.accepted
+    assert rejected.any(), "SVK bears six loads of ten times L: choose harder ones"
+    factors = shard.columns["load_factor"][rejected]
+    assert ((factors >= 0) & (factors < 1)).all()
+    assert len(list(filter(None, reasons(shard.columns)))) == int(rejected.sum())
+    accepted = int(shard.accepted.sum())
+    if accepted:
+        assert len(store.load("train", 6).force) == accepted
+    assert f"{accepted} of 6 loads accepted" in store.summary()
+    assert f" rejected: {reasons(shard.columns)[0]}" in store.summary()
     assert sum(part.tried for part in store.acceptance()) == 6
-    assert sum(part.accepted for part in store.acceptance()) == line["accepted"]
+    assert sum(part.accepted for part in store.acceptance()) == accepted
     assert flaws(store) == {}
 
 
@@ -147,30 +123,12 @@ def test_a_shard_may_hold_rejected_loads_only(scene, fresh, monkeypatch):
     fill(fresh, {"train": range(3)})
     assert fresh.missing("train", 4) == [3]
     assert flaws(fresh) == {}
-    assert {one["reason"] for one in lines(fresh)[0]["rejected"]} == {"never"}
+    assert reasons(fresh.shards()[0].columns) == 3 * ["never"]
     with pytest.raises(DataSetError, match="no train samples"):
         fresh.load("train", 3)
     monkeypatch.undo()
     fill(fresh, {"train": [3]})
     assert len(fresh.load("train", 4).force) == 1
-
-
-# ------------------------------------------------------------------ forces
-
-
-@pytest.mark.parametrize("shape", [(7, 3), (5, 2)])
-def test_forces_are_restored_from_their_sparse_form(shape):
-    generator = torch.Generator().manual_seed(0)
-    force = torch.randn(6, *shape, generator=generator, dtype=torch.float64)
-    force[torch.rand(6, shape[0], generator=generator) < 0.6] = 0.0
-    force[0, 2], force[0, 2, 1] = 0.0, 1e-300  # one component of a node is a node that carries
-    force[3] = 0.0
-    packed = to_sparse(force)
-    assert torch.equal(to_dense(packed, shape), force)
-    assert len(packed["nodal_force"]) == len(packed["node"]) == packed["n_loaded_nodes"].sum()
-    assert packed["n_loaded_nodes"][3] == 0
-    assert packed["node"].dtype == torch.int32
-    assert packed["nodal_force"].abs().amax(dim=1).min() > 0, "nothing is stored of idle nodes"
 
 
 def test_forces_that_every_load_holds_are_stored_and_verified(scene, make_scene, tmp_path):
@@ -194,12 +152,6 @@ def test_samples_of_plane_bodies_are_stored(make_scene, tmp_path):
 # ------------------------------------------------------------------ the same bytes
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_the_bytes_do_not_depend_on_the_number_of_workers(data, fresh, workers):
-    fill(fresh, WANTED, workers=workers)
-    assert content(fresh.folder) == content(data.store.folder)
-
-
 def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fresh, monkeypatch):
     def backwards(scene, jobs, **more):
         return worker_pool.solve_loads(scene, list(jobs)[::-1], **more)
@@ -212,47 +164,67 @@ def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fr
 def test_the_samples_do_not_depend_on_the_size_of_shards(data, fresh, monkeypatch):
     monkeypatch.setattr(store_module, "SHARD_SIZE", 5)
     fill(fresh, WANTED)
-    assert max(line["tried"] for line in lines(fresh)) == 5
+    assert max(len(shard.tried) for shard in fresh.shards()) == 5
     for split, count in SIZES.items():
-        assert fresh.digest(split, count) == data.store.digest(split, count)
+        assert same(fresh.load(split, count), data.store.load(split, count))
     assert flaws(fresh) == {}
 
 
 # ------------------------------------------------------------------ growing
 
 
-def test_growing_solves_only_the_new_loads_and_gives_the_same_samples(data, fresh, solved):
+def test_growing_solves_only_the_new_loads_and_gives_the_bytes_of_one_run(data, fresh, solved):
     fill(fresh, {"train": range(5)})
     before = fresh.load("train", 5)
-    files = content(fresh.folder)
     solved.clear()
     fill(fresh, {"train": fresh.missing("train", 12)})
     assert solved == [(0, 0, index) for index in range(5, 12)]
     assert same([column[:5] for column in fresh.load("train", 12)], before)
     assert fresh.missing("train", 12) == []
-    assert fresh.digest("train", 12) == data.store.digest("train", 12)
-    assert all(
-        content(fresh.folder)[name] == was for name, was in files.items() if "manifest" not in name
-    )
-    assert [(line["first"], line["tried"]) for line in lines(fresh)] == [(0, 5), (5, 7)]
+    fill(fresh)
+    assert content(fresh.folder) == content(data.store.folder)
 
 
-def test_shards_begin_at_multiples_of_their_size(fresh, monkeypatch):
-    monkeypatch.setattr(store_module, "SHARD_SIZE", 4)
-    for count in (6, 11):
-        fill(fresh, {"train": fresh.missing("train", count)})
-    assert [(line["first"], line["tried"]) for line in lines(fresh)] == [
-        (0, 4), (4, 2), (6, 2), (8, 3)
-    ]  # fmt: skip
+def test_loads_are_samples_before_their_files_are_merged(fresh, monkeypatch):
+    monkeypatch.setattr(store_module.Store, "merge", lambda *_: None)
+    fill(fresh, {"train": [0, 1, 2, 3, 4, 5, 7]})
+    assert len(list(fresh.folder.glob("train-*"))) == 7
+    assert fresh.scattered() == [("train", 0)]
+    expected = fresh.scene.loads.sample((0, 0), [4, 5, 7]).force
+    assert torch.equal(fresh.load("train", 8, first=4).force, expected)
+    assert fresh.tried("train") == {0, 1, 2, 3, 4, 5, 7}
+    assert fresh.missing("train", 8) == [6]
+    monkeypatch.undo()
+    assert fill(fresh, {"train": [6]}) == 1
+    assert [shard.tried for shard in fresh.shards()] == [list(range(8))]
 
 
-def test_a_load_that_two_writers_have_solved_is_read_once(data, copy):
-    """Parts of different divisions were copied into one folder."""
-    (copy.folder / "manifest-0-of-2.jsonl").write_bytes(
-        (copy.folder / "manifest.jsonl").read_bytes()
-    )
-    for split, size in SIZES.items():
-        assert same(copy.load(split, size), data.store.load(split, size))
+@pytest.mark.parametrize("reads", ["shards", "load"])
+def test_a_reader_waits_for_a_writer_that_merges_files(data, fresh, monkeypatch, reads):
+    merge = Store.merge
+    monkeypatch.setattr(Store, "merge", lambda *_: None)
+    fill(fresh, WANTED)
+    method = "describe" if reads == "shards" else "read"
+    genuine, merged = getattr(Store, method), []
+
+    def after_the_merge(self, path):
+        if path.name == "train-000003.safetensors" and not merged:
+            merged.append(path)
+            for block in self.scattered():
+                merge(self, *block)
+        return genuine(self, path)
+
+    monkeypatch.setattr(Store, method, after_the_merge)
+    assert same(fresh.load("train", 12), data.store.load("train", 12))
+    assert merged
+
+
+def test_a_load_in_two_files_is_read_once_and_merged(data, copy):
+    """A writer was killed after it had merged files and before it removed them."""
+    copy.write(solve_load(copy.scene, LoadKey(copy.stream("train"), 7)))
+    assert same(copy.load("train", 12), data.store.load("train", 12))
+    fill(copy)
+    assert content(copy.folder) == content(data.store.folder)
 
 
 # ------------------------------------------------------------------ parts
@@ -270,16 +242,6 @@ def test_a_second_writer_of_the_whole_or_of_the_same_part_is_refused(fresh):
     assert fill(fresh) == 19
 
 
-def test_a_pending_file_that_another_process_removes_is_ignored(data, fresh):
-    writer(fresh).create()
-    pending = fresh.folder / "pending"
-    pending.mkdir()
-    gone = pending / "train-000099.load"
-    gone.symlink_to(pending / "nothing")  # listed, and then not there
-    assert fresh.pending.files() == {}
-    gone.unlink()
-
-
 # ------------------------------------------------------------------ interruption
 
 
@@ -290,7 +252,7 @@ def test_an_error_in_writing_ends_the_workers(fresh, monkeypatch):
     def keep(self, one):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(PendingLoads, "write", keep)
+    monkeypatch.setattr(Store, "write", keep)
     with pytest.raises(OSError, match="No space left") as held:
         fill(fresh, WANTED, workers=1)
     try:
@@ -334,9 +296,9 @@ def test_a_body_of_another_size_shares_the_set_with_its_own_moduli(copy, make_sc
 def test_a_folder_that_is_no_data_set_is_refused_and_not_changed(scene, tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
     store = Store(tmp_path, scene, 0)
-    with pytest.raises(DataSetError, match="no data set"):
-        fill(store, WANTED)
-    repair(store)
+    for use in (lambda: fill(store, WANTED), lambda: repair(store)):
+        with pytest.raises(DataSetError, match="no data set"):
+            use()
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
@@ -345,7 +307,7 @@ def test_a_folder_that_is_no_data_set_is_refused_and_not_changed(scene, tmp_path
     [
         *("", "{", "[]", "null", "\0\0\0"),
         '{"format": 99}',
-        '{"format": 3, "fingerprint": 3}',
+        '{"format": 5, "fingerprint": 3}',
     ],
 )
 def test_a_damaged_scene_file_is_refused_by_name(copy, harm):
@@ -356,10 +318,10 @@ def test_a_damaged_scene_file_is_refused_by_name(copy, harm):
 
 def test_values_of_another_scene_are_compared_by_key(copy):
     """1 equals 1.0 even if the fingerprint differs."""
-    card, found = json.loads((copy.folder / "scene.json").read_text()), copy.shards()
+    card = json.loads((copy.folder / "scene.json").read_text())
     card["fingerprint"], card["scene"]["degree"] = "0f" * 32, 1.0
     (copy.folder / "scene.json").write_text(json.dumps(card))
-    assert copy.shards() == found
+    assert len(copy.shards()) == 3
     card["scene"]["loads"]["deflection"] = 0.3
     (copy.folder / "scene.json").write_text(json.dumps(card))
     with pytest.raises(DataSetError, match=r"\(loads\.deflection: 0\.3 there, 0\.4 here\)"):
@@ -379,9 +341,7 @@ def test_a_folder_of_another_seed_and_a_file_are_refused_by_their_key(copy, tmp_
 def test_a_read_only_folder_can_only_be_read(copy, environment):
     """The folder is mounted read-only, since root may write everywhere."""
     code = (
-        "import sys; from dpl.system.files import read_jsonl; from pathlib import Path; "
-        "folder = Path(sys.argv[1]); "
-        "assert len(read_jsonl(folder / 'manifest.jsonl')) == 3; "
+        "import sys; from pathlib import Path; folder = Path(sys.argv[1]); "
         "from dpl.data.storage.store import Store; from dpl.data import DataSet; "
         "from types import SimpleNamespace as N; import json; "
         "card = json.loads((folder / 'scene.json').read_text()); "
@@ -402,117 +362,6 @@ def test_a_read_only_folder_can_only_be_read(copy, environment):
     assert ended.stdout.split() == ["read", "only"], ended.stderr[-1000:]
 
 
-# ------------------------------------------------------------------ damage
-
-
-@pytest.mark.parametrize("harm", ["a flipped bit", "a cut end", "no file"])
-def test_a_damaged_shard_is_refused_by_name(copy, harm):
-    path = copy.folder / lines(copy)[0]["file"]
-    content = bytearray(path.read_bytes())
-    content[-9] ^= 1
-    path.write_bytes(content if harm == "a flipped bit" else content[:-8])
-    if harm == "no file":
-        path.unlink()
-    with pytest.raises(DataSetError, match=f"{path.name}.*action=repair"):
-        copy.load(lines(copy)[0]["split"], 4)
-    assert list(flaws(copy)) == [path.name]
-
-
-def out_of_balance(shard):
-    shard["displacement"][1, 20:30] *= 1.0 + 1e-5
-
-
-def inverted(shard):
-    shard["displacement"][0] *= -30.0
-
-
-def not_a_number(shard):
-    shard["displacement"][0, 20] = float("nan")
-
-
-def another_load(shard):
-    shard["nodal_force"] *= 0.5
-
-
-def another_order(shard):
-    shard["displacement"] = shard["displacement"].flip(0).contiguous()
-
-
-def another_name(shard):
-    shard["index"] += 100
-
-
-def another_point(shard):
-    shard["point"][:, -1] = 0.25
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        *(out_of_balance, inverted, not_a_number, another_load, another_order, another_name),
-        another_point,
-    ],
-)
-def test_verify_finds_damaged_shards_whose_digest_is_right(data, copy, change):
-    before = content(data.store.folder)
-    name = rewrite(copy, change)
-    assert list(flaws(copy)) == [name]
-    assert mended(copy) == [name]
-    fill(copy)
-    after = content(copy.folder)
-    assert sorted(after.pop("manifest.jsonl").splitlines()) == sorted(
-        before.pop("manifest.jsonl").splitlines()
-    )
-    assert after == before
-
-
-@pytest.mark.parametrize("harm", [{"split": "vrain"}, {"file": "/dev/zero"}, {"tried": 10**12}])
-def test_an_invalid_line_of_the_manifest_is_solved_again(copy, data, harm):
-    found = lines(copy)
-    assert found[0]["split"] == "train"
-    found[0] |= harm
-    (copy.folder / "manifest.jsonl").write_text("".join(json.dumps(one) + "\n" for one in found))
-    assert copy.missing("train", 12) == list(range(12))
-    assert copy.summary()
-    repair(copy)
-    fill(copy)
-    assert content(copy.folder) == content(data.store.folder)
-
-
-@pytest.mark.parametrize(
-    ("name", "harm"),
-    [
-        *(("scene.json", harm) for harm in ("a link", "huge", "a folder")),
-        *(("manifest.jsonl", harm) for harm in ("a loop", "a pipe", "huge")),
-        *(("modes.safetensors", harm) for harm in ("a folder", "a link", "huge")),
-        *(("shard", harm) for harm in ("a pipe", "a loop", "huge", "a link")),
-    ],
-)
-def test_irregular_files_are_refused_by_name_and_not_read(copy, tmp_path, name, harm):
-    name = lines(copy)[0]["file"] if name == "shard" else name
-    path = copy.folder / name
-    if harm == "huge":
-        os.truncate(path, 2**40)
-    else:
-        path.rename(tmp_path / "outside")
-    if harm in ("a link", "a loop"):
-        path.symlink_to(tmp_path / "outside" if harm == "a link" else path.name)
-    elif harm == "a folder":
-        path.mkdir()
-    elif harm == "a pipe":
-        os.mkfifo(path)
-    read = copy.modes if name == "modes.safetensors" else partial(copy.load, "train", 12)
-    with pytest.raises(DataSetError, match=name) as refusal:
-        read()
-    assert "\n" not in str(refusal.value)
-
-
-def test_modes_of_another_precision_are_found(copy):
-    path = copy.folder / "modes.safetensors"
-    path.write_bytes(save({name: column.float() for name, column in load_file(path).items()}))
-    assert list(flaws(copy)) == ["modes.safetensors"]
-
-
 @pytest.mark.parametrize("line", ["{}", '{"loads": "many"}', "[" * 99_999, '{"loads": NaN}'])
 def test_an_invalid_line_of_the_journal_is_ignored(copy, line):
     reported, a_load = copy.summary(), copy.seconds_per_load()
@@ -521,66 +370,12 @@ def test_an_invalid_line_of_the_journal_is_ignored(copy, line):
     assert (copy.summary(), copy.seconds_per_load()) == (reported, a_load)
 
 
-def test_a_shard_under_the_name_of_another_is_refused(copy):
-    (first, *_) = (line for line in lines(copy) if line["split"] == "train")
-    name = shard_name("train", 6400)
-    (copy.folder / name).write_bytes((copy.folder / first["file"]).read_bytes())
-    line = first | {"first": 6400, "file": name, "rejected": [], "accepted": first["tried"]}
-    with (copy.folder / "manifest.jsonl").open("a") as file:
-        file.write(json.dumps(line) + "\n")
-    assert len(copy.load("train", 12).force) == 12
-    with pytest.raises(DataSetError, match=r"holds other loads than its line of the manifest"):
-        copy.load("train", 6401)
-
-
-def test_a_load_under_the_name_of_another_is_solved_again(fresh, data, scene):
-    writer(fresh).create()
-    paths = [fresh.pending.write(solve_load(scene, LoadKey((0, 0), number))) for number in (0, 1)]
-    paths[1].write_bytes(paths[0].read_bytes())
-    (paths[0].parent / "train-one.load").write_bytes(b"mine")
-    (paths[0].parent / "rain-000001.load").write_bytes(b"mine")
-    assert [job.number for job in fresh.pending.files()] == [0]
-    assert fill(fresh) == 19
-    assert fresh.digest("train", 12) == data.store.digest("train", 12)
-
-
-def test_a_file_outside_the_folder_is_not_read(copy):
-    found = lines(copy)
-    shutil.copy(copy.folder / found[0]["file"], copy.folder.parent / "outside.safetensors")
-    found[0]["file"] = "../outside.safetensors"
-    (copy.folder / "manifest.jsonl").write_text("".join(json.dumps(line) + "\n" for line in found))
-    with pytest.raises(
-        DataSetError, match=r"outside\.safetensors is not in the folder of the data set"
-    ):
-        copy.load(found[0]["split"], 4)
-    assert list(flaws(copy)) == [
-        "../outside.safetensors",
-        found[0]["split"] + "-000000.safetensors",
-    ]
-
-
-def test_repair_removes_files_that_no_manifest_names(copy):
-    before = content(copy.folder)
-    stray = copy.folder / "train-000012.safetensors"
-    stray.write_bytes(b"half a shard")
-    part = copy.folder / ".val-000004.safetensors.99.part"
-    part.write_bytes(b"half a shard")
-    (copy.folder / "notes.txt").write_text("mine")
-    assert copy.missing("train", 20) == list(range(12, 20))
-    assert len(copy.load("train", 20).force) == 12
-    repair(copy)
-    assert not stray.exists()
-    assert not part.exists()
-    assert (copy.folder / "notes.txt").exists()
-    assert content(copy.folder) == before
-
-
 # ------------------------------------------------------------------ reports
 
 
 def test_the_summary_states_mean_iterations_and_size(copy):
-    shards = [line for line in copy.shards() if line["split"] == "train"]
-    mean = sum(line["iterations"] for line in shards) / sum(line["tried"] for line in shards)
+    (shard,) = copy.shards("train")
+    mean = int(shard.columns["iterations"].sum()) / len(shard.tried)
     assert f"{mean:.1f} Newton iterations" in copy.summary()
     with (copy.folder / "large.safetensors").open("wb") as file:
         file.truncate(30_000_000)  # sparse

@@ -389,18 +389,6 @@ def test_the_load_family_of_the_page_on_extensions_is_in_pascals(own_conf):
         own_conf("extend.md", *own, "loads.largest=-1")
 
 
-def test_the_load_family_of_the_page_on_extensions_is_trained_and_evaluated(
-    blocks, script, tiny_training, tmp_path
-):
-    blocks("extend.md")
-    own = ["--config-dir", "my_conf", "loads=end", "loads.largest=4.5", "run=runs/end"]
-    tiny = [word for word in tiny_training if not word.startswith("loads.")]
-    ended = script("train", *own, *tiny, "trainer.max_epochs=1", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    ended = script("evaluate", "run=runs/end", "trust=true", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-
-
 def test_the_boundary_values_of_the_page_on_usage_are_in_si_units(own_conf, tmp_path, monkeypatch):
     """Its Python needs a mesh file; the experiment is a body of 1,100 kg/m^3 on soil."""
     monkeypatch.chdir(tmp_path)

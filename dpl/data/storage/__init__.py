@@ -1,1 +1,1 @@
-"""Files of a data set: shards, manifests, pending loads, journal; verification and repair."""
+"""Files of a data set: shards and journal; verification and repair."""

@@ -61,6 +61,6 @@ def bias_warning(bins: Sequence[AmplitudeBin]) -> str:
     worst = min(biased, key=lambda part: part.accepted / part.tried)
     return (
         f"the data set is biased: only {worst.accepted} of {worst.tried} loads with amplitudes "
-        f"{worst.low:.2f} to {worst.high:.2f} were accepted; lower loads.deflection, or read the "
-        "reasons in the manifest"
+        f"{worst.low:.2f} to {worst.high:.2f} were accepted; lower loads.deflection, or "
+        "read the reasons in the summary of scripts/generate.py"
     )

@@ -7,11 +7,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dpl.data.storage.manifest import is_number
 from dpl.system.files import append_jsonl, read_jsonl
 from dpl.version import __version__
 
 NAME = "journal.jsonl"
+UPPER_LIMIT = 1e15  # of a number in a journal
 
 
 class Session:
@@ -50,10 +50,18 @@ class Session:
             append_jsonl(folder / NAME, line)
 
 
-def read_sessions(folder: Path) -> list[dict[str, Any]]:
-    """Return the lines of a journal that give numbers of loads and durations."""
-    return [
-        line
-        for line in read_jsonl(folder / NAME)
-        if all(is_number(line.get(key)) for key in ("loads", "seconds", "core_seconds"))
-    ]
+def totals(folder: Path) -> tuple[int, float, float, float]:
+    """Return the numbers of sessions and of loads, wall time and core time of a journal [s].
+
+    Lines that do not give these numbers are left out.
+    """
+    keys = "loads", "seconds", "core_seconds"
+    rows: list[list[Any]] = [[line.get(key) for key in keys] for line in read_jsonl(folder / NAME)]
+    valid = [row for row in rows if all(map(is_number, row))]
+    loads, wall, core = (sum(row[k] for row in valid) for k in range(len(keys)))
+    return len(valid), loads, wall, core
+
+
+def is_number(value: Any) -> bool:
+    """Return True for a number that a journal may hold."""
+    return type(value) in (int, float) and 0 <= value < UPPER_LIMIT

@@ -1,101 +1,197 @@
-"""Solved loads as columns of a safetensors file; forces are stored at loaded nodes only.
+"""Shards: solved loads as columns of a safetensors file; forces are stored at loaded nodes only.
 
-A pending load and a shard have the same columns, so that a shard is the concatenation of the
-columns of its loads.
+Files of one load and of many have the same columns, so that files are merged by concatenation. The
+metadata of a file hold the SHA-256 of its name and its columns.
 """
 
-from collections.abc import Mapping, Sequence
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
 from dpl.data.solving.solve import SolvedLoad
 
 Columns = dict[str, Tensor]
 
-INTEGERS = dict.fromkeys(("index", "n_loaded_nodes", "iterations"), torch.int64)
-INTEGERS["node"] = torch.int32
-FINITE = {"point", "nodal_force", "displacement", "parameters"}  # columns of a sample
+TRIED = ("tried", "amplitude", "iterations", "load_factor")  # columns with a row for each load
+REASON = 64  # bytes of a row of the column `reason`, one for each rejected load
+DESCRIPTION = (*TRIED, "index", "reason")  # columns that are read alone
+FINITE = {"amplitude", "point", "nodal_force", "displacement", "parameters"}
+SOLUTIONS = (  # columns with a row for each accepted load, or for each of its loaded nodes
+    *("index", "point", "n_loaded_nodes", "node", "nodal_force"),
+    *("displacement", "residual", "volume_ratio", "parameters"),
+)
+INTEGERS = dict.fromkeys(("tried", "index", "n_loaded_nodes", "iterations"), torch.int64)
+INTEGERS |= {"node": torch.int32, "reason": torch.uint8}
+MAX_INTEGER = 2**53
 
 
 def encode_load(solved: SolvedLoad, parameters: Tensor) -> Columns:
-    """Return the columns of a shard of one load; they have no rows if the load is rejected.
+    """Return the columns of one load.
 
     Args:
         solved: The load.
         parameters: Its parameters, (1, P), see `LoadFamily.parameter_ranges`.
     """
-    columns = {
-        "index": torch.tensor([solved.job.number]),
+    number = torch.tensor([solved.job.number])
+    solution = {
+        "index": number,
         "point": torch.from_numpy(solved.point)[None],
         **to_sparse(torch.from_numpy(solved.force)[None]),
         "displacement": torch.from_numpy(solved.displacement)[None],
         "residual": torch.tensor([solved.residual], dtype=torch.float64),
         "volume_ratio": torch.tensor([solved.volume_ratio], dtype=torch.float64),
-        "iterations": torch.tensor([solved.iterations]),
         "parameters": parameters.contiguous(),
     }
-    return columns if solved.accepted else {name: c[:0] for name, c in columns.items()}
+    reason = list(solved.reason.encode()[:REASON].ljust(REASON))
+    return {
+        "tried": number,
+        "amplitude": torch.tensor([round(solved.amplitude, 6)], dtype=torch.float64),
+        "iterations": torch.tensor([solved.iterations]),
+        "load_factor": torch.tensor([solved.load_factor], dtype=torch.float64),
+        **{name: c if solved.accepted else c[:0] for name, c in solution.items()},
+        "reason": torch.tensor([reason], dtype=torch.uint8)[int(solved.accepted) :],
+    }
 
 
-def concatenate(parts: Sequence[Columns]) -> Columns:
-    """Return the columns of several shards as those of one."""
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+def reasons(columns: Columns) -> list[str]:
+    """Return why each rejected load was rejected."""
+    return [bytes(row).decode(errors="replace").rstrip() for row in columns["reason"].tolist()]
 
 
-def decode_shard(
-    content: bytes, shape: tuple[int, ...], dimension: int, n_parameters: int = 0
+def single_loads(columns: Columns) -> dict[int, Columns]:
+    """Return the columns of each load alone, by the number of the load."""
+    tried, nodes = columns["tried"], columns["n_loaded_nodes"]
+    accepted = torch.isin(tried, columns["index"])
+    loaded = torch.zeros_like(tried).masked_scatter(accepted, nodes)
+    rows = dict.fromkeys(SOLUTIONS, accepted.long()) | dict.fromkeys(TRIED, torch.ones_like(tried))
+    rows |= {"node": loaded, "nodal_force": loaded, "reason": (~accepted).long()}
+    parts = {name: column.split(rows[name].tolist()) for name, column in columns.items()}
+    return {
+        number: {name: part[k] for name, part in parts.items()}
+        for k, number in enumerate(tried.tolist())
+    }
+
+
+def encode_shard(name: str, loads: Iterable[Columns]) -> bytes:
+    """Return the content of a file of this name with some loads."""
+    loads = list(loads)
+    columns = {key: torch.cat([load[key] for load in loads]) for key in loads[0]}
+    return save(columns, {"sha256": digest(name, columns)})
+
+
+def digest(name: str, columns: Columns) -> str:
+    """Return the SHA-256 of the name of a shard and of its columns, in hexadecimal."""
+    found = hashlib.sha256(name.encode())
+    for key, column in sorted(columns.items()):
+        found.update(f" {key} {column.dtype} {tuple(column.shape)} ".encode())
+        found.update(column.numpy().tobytes())
+    return found.hexdigest()
+
+
+def read_description(path: Path) -> Columns:
+    """Return the columns of `DESCRIPTION`; the digest of the file is not checked.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: A column is damaged, see `read_shard`.
+    """
+    return _read(path, DESCRIPTION)[0]
+
+
+def read_shard(
+    path: Path, shape: tuple[int, ...], dimension: int, n_parameters: int = 0
 ) -> Columns:
     """Return the columns of a shard.
 
     Args:
-        content: Content of the file.
+        path: The file.
         shape: (N, D).
         dimension: d, number of coordinates of the point that a load is drawn from.
         n_parameters: P, number of parameters of a load.
 
     Raises:
-        ValueError: A column is missing or has a wrong shape, type or value. The message continues
-            a sentence that starts with the name of the file.
+        FileNotFoundError: The file does not exist.
+        ValueError: A column is missing or has a wrong shape, type or value, or the digest is wrong.
+            The message continues a sentence that starts with the name of the file.
     """
+    columns, stored = _read(path, (*TRIED, *SOLUTIONS, "reason"))
+    flaw = _flaw_of_solutions(columns, shape, dimension, n_parameters)
+    if not flaw and stored != digest(path.name, columns):
+        flaw = "the SHA-256 of its name and its columns is wrong"
+    if flaw:
+        raise ValueError(f"is damaged: {flaw}")
+    return columns
+
+
+def _read(path: Path, names: Sequence[str]) -> tuple[Columns, str | None]:
+    """Return some columns, with those of `DESCRIPTION` checked, and the digest."""
     try:
-        shard = load(content)
-        flaw = _flaw_of_columns(shard, shape, dimension, n_parameters)
+        with safe_open(path, "pt") as file:
+            # copied, because the memory of the tensors is that of the file
+            columns = {name: file.get_tensor(name).clone() for name in names}
+            stored = (file.metadata() or {}).get("sha256")
+        flaw = _flaw_of_description(columns)
     except (SafetensorError, KeyError, TypeError, RuntimeError) as error:
         flaw = str(error)
     if flaw:
         raise ValueError(f"is damaged: {flaw}")
-    return shard
+    return columns, stored
 
 
-def _flaw_of_columns(
-    shard: Columns, shape: tuple[int, ...], dimension: int, n_parameters: int
+def _flaw_of_description(columns: Columns) -> str:
+    count, accepted = len(columns["tried"]), len(columns["index"])
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(TRIED, (count,))
+    shapes |= {"index": (accepted,), "reason": (count - accepted, REASON)}
+    if flaw := _flaw_of_shapes(columns, shapes):
+        return flaw
+    tried, index, iterations = (columns[name] for name in ("tried", "index", "iterations"))
+    if not count or (tried.diff() <= 0).any() or not 0 <= tried[0] <= tried[-1] < MAX_INTEGER:
+        return "the numbers of its loads are not ascending"
+    if (index.diff() <= 0).any() or not torch.isin(index, tried).all():
+        return "an accepted load was not tried"
+    if not ((iterations >= 0) & (iterations < MAX_INTEGER)).all():
+        return "a number of iterations is out of range"
+    return "" if (columns["amplitude"] >= 0).all() else "an amplitude is negative"
+
+
+def _flaw_of_solutions(
+    columns: Columns, shape: tuple[int, ...], dimension: int, n_parameters: int
 ) -> str:
-    count, n_loaded_nodes = len(shard["index"]), int(shard["n_loaded_nodes"].sum())
+    count = len(columns["index"])
+    if flaw := _flaw_of_shapes(columns, {"n_loaded_nodes": (count,)}):
+        return flaw
+    n_loaded_nodes = int(columns["n_loaded_nodes"].sum())
     shapes = {
-        "index": (count,),
         "point": (count, dimension),
-        "n_loaded_nodes": (count,),
         "node": (n_loaded_nodes,),
         "nodal_force": (n_loaded_nodes, shape[1]),
         "displacement": (count, *shape),
         "residual": (count,),
         "volume_ratio": (count,),
-        "iterations": (count,),
         "parameters": (count, n_parameters),
     }
+    if flaw := _flaw_of_shapes(columns, shapes):
+        return flaw
+    if not ((columns["n_loaded_nodes"] >= 0) & (columns["n_loaded_nodes"] <= shape[0])).all():
+        return "a number of loaded nodes is negative or exceeds N"
+    if not ((columns["node"] >= 0) & (columns["node"] < shape[0])).all():
+        return "a loaded node does not exist"
+    return ""
+
+
+def _flaw_of_shapes(columns: Columns, shapes: Mapping[str, tuple[int, ...]]) -> str:
+    """Return which column has another shape or type, or is not finite; empty if none."""
     for name, expected in shapes.items():
-        column = shard[name]
+        column = columns[name]
         if (tuple(column.shape), column.dtype) != (expected, INTEGERS.get(name, torch.float64)):
             return f"{name} has shape and type {tuple(column.shape)}, {column.dtype}"
         if name in FINITE and not column.isfinite().all():
             return f"{name} is not finite"
-    if not ((shard["n_loaded_nodes"] >= 0) & (shard["n_loaded_nodes"] <= shape[0])).all():
-        return "a number of loaded nodes is negative or exceeds N"
-    if not ((shard["node"] >= 0) & (shard["node"] < shape[0])).all():
-        return "a loaded node does not exist"
     return ""
 
 

@@ -1,25 +1,26 @@
-"""Data set on disk: immutable safetensors shards and manifests that name them.
+"""Data set on disk: safetensors shards of solved loads.
 
     FOLDER/scene.json            fingerprint of the scene with its fields, seed, versions
     FOLDER/modes.safetensors     eigenvalues and eigenvectors that the loads are made of
-    FOLDER/train-000000.safetensors, ...
-    FOLDER/manifest.jsonl        one line per shard: name, SHA-256, loads tried, rejected loads
-    FOLDER/manifest-1-of-4.jsonl the same of one of several writers
+    FOLDER/train-000000.safetensors, ...  solved loads, named by the first one
     FOLDER/journal.jsonl         one line per session: date, machine, duration
-    FOLDER/pending/              solved loads whose shard is not complete, one file each
 
-A shard that no manifest names is ignored. The same loads give the same bytes for any number of
-workers and after any interruption.
+A solved load is written to a file of its own at once. Files of one block of `SHARD_SIZE` loads are
+merged when its loads have been tried. The same loads give the same bytes for any number of workers
+and after any interruption.
 """
 
-import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import re
+import stat
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,18 +28,47 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
+from dpl.data.solving.solve import SolvedLoad
 from dpl.data.storage.acceptance import AmplitudeBin, acceptance_table, amplitude_bins
-from dpl.data.storage.journal import read_sessions
-from dpl.data.storage.manifest import STREAMS, accepted_loads, read_manifest, sort_key, tried_loads
-from dpl.data.storage.pending import PendingLoads
-from dpl.data.storage.shard import Columns, decode_shard, to_dense
+from dpl.data.storage.journal import totals
+from dpl.data.storage.shard import (
+    REASON,
+    Columns,
+    encode_load,
+    encode_shard,
+    read_description,
+    read_shard,
+    reasons,
+    single_loads,
+    to_dense,
+)
 from dpl.scene import Sample, Scene
-from dpl.system.files import DataSetError, read_regular_file
+from dpl.system.files import DataSetError, read_regular_file, write_file
 
-FORMAT = 4
+FORMAT = 5
+STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
 MODES = "modes.safetensors"
+SHARD_NAME = re.compile(rf"({'|'.join(STREAMS)})-(\d{{6,16}})\.safetensors")
 HEADER = 100_000  # largest size of a shard without its numbers [bytes]
-SHARD_SIZE = 64  # loads in one file
+SHARD_SIZE = 64  # loads in one block, and at most in one file
+
+
+class Shard(NamedTuple):
+    """A file of solved loads: its path, its split, and its columns of `shard.DESCRIPTION`."""
+
+    path: Path
+    split: str
+    columns: Columns
+
+    @property
+    def tried(self) -> list[int]:
+        """Numbers of its loads, accepted or rejected."""
+        return self.columns["tried"].tolist()
+
+    @property
+    def accepted(self) -> Tensor:
+        """Whether each of its loads was accepted, (T,)."""
+        return torch.isin(self.columns["tried"], self.columns["index"])
 
 
 @dataclass(frozen=True)
@@ -59,14 +89,8 @@ class Store:
         """Return the seed of the loads of a split."""
         return self.seed, STREAMS[split]
 
-    @property
-    def pending(self) -> PendingLoads:
-        """Solved loads whose shard is not complete."""
-        streams = {name: self.stream(name) for name in STREAMS}
-        return PendingLoads(self.folder / "pending", streams, self.scene.loads.parameters_at)
-
-    def shards(self) -> list[dict[str, Any]]:
-        """Return the lines of all manifests, sorted; empty if there is no data set yet.
+    def exists(self) -> bool:
+        """Return True if the folder holds the data set, False if nothing is there.
 
         Raises:
             DataSetError: The folder holds something else.
@@ -77,7 +101,7 @@ class Store:
         names = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
         if card.name not in names:
             if {name for name in names if name[0] != "."} <= {MODES}:
-                return []
+                return False
             raise DataSetError(
                 f"{self.folder} is not empty and no data set; choose another data.folder"
             )
@@ -89,12 +113,53 @@ class Store:
             raise DataSetError(
                 f"{card} is damaged ({error}); choose another data.folder or remove this one"
             ) from None
-        lines = [line for path in self.manifests() for line in read_manifest(path)]
-        return sorted(lines, key=sort_key)
+        return True
 
-    def manifests(self) -> list[Path]:
-        """Return the paths of the manifests of all writers."""
-        return sorted(self.folder.glob("manifest*.jsonl"))
+    def files(self) -> list[Path]:
+        """Return the files that are or could be shards."""
+        return [p for p in sorted(self.folder.glob("*.safetensors")) if p.name != MODES]
+
+    def shards(self, split: str | None = None, block: int | None = None) -> list[Shard]:
+        """Return the shards, of one split or of one block; files that are none are left out.
+
+        Raises:
+            DataSetError: The folder holds something else.
+        """
+        if not self.exists():
+            return []
+        while True:
+            found = []
+            with suppress(FileNotFoundError):  # another writer merges files: read them again
+                for path in self.files():
+                    name = SHARD_NAME.fullmatch(path.name)
+                    if not name or split not in (None, name[1]):
+                        continue
+                    if block in (None, int(name[2]) // SHARD_SIZE):
+                        with suppress(ValueError):  # damaged; `verify` reports it
+                            found.append(self.describe(path))
+                return found
+
+    def describe(self, path: Path) -> Shard:
+        """Return a shard without its solutions; raise ValueError if it is damaged."""
+        self._check_file(path)
+        name, columns = SHARD_NAME.fullmatch(path.name), read_description(path)
+        if name is None or int(name[2]) != columns["tried"][0]:
+            raise ValueError("has another name than that of its first load")
+        return Shard(path, name[1], columns)
+
+    def read(self, path: Path) -> Columns:
+        """Return the columns of a shard; raise ValueError if it is damaged, see `read_shard`."""
+        self._check_file(path)
+        loads = self.scene.loads
+        shape, n_parameters = self.scene.problem.shape, len(loads.parameter_ranges)
+        return read_shard(path, shape, loads.n_random, n_parameters)
+
+    def _check_file(self, path: Path) -> None:
+        status = path.lstat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ValueError("is not a regular file (symbolic links are refused)")
+        if status.st_size > self.max_shard_size(SHARD_SIZE):
+            raise ValueError("is damaged: it is larger than its loads")
 
     def _check(self, card: dict[str, Any]) -> None:
         """Raise DataSetError if the data set is one of another format, scene or seed."""
@@ -123,15 +188,16 @@ class Store:
         Of several writers `shards`, who take blocks of `SHARD_SIZE` loads in turn, only the loads
         of writer `shard` are returned.
         """
-        tried = {number for line in self._shards_of(split) for number in tried_loads(line)}
+        tried = self.tried(split)
         return [
             number
             for number in range(count)
             if number // SHARD_SIZE % shards == shard and number not in tried
         ]
 
-    def _shards_of(self, split: str) -> list[dict[str, Any]]:
-        return [line for line in self.shards() if line["split"] == split]
+    def tried(self, split: str) -> set[int]:
+        """Return the loads of a split that have been tried."""
+        return {number for shard in self.shards(split) for number in shard.tried}
 
     def load(self, split: str, count: int, first: int = 0) -> Sample:
         """Return the accepted ones of loads `first` to `count` - 1 of a split, in order.
@@ -141,14 +207,10 @@ class Store:
         Raises:
             DataSetError: A shard is damaged, or there are no samples.
         """
-        parts = self._pending_columns(split, first, count)  # before the shards that take them
-        parts += [
-            self._read_shard(line)
-            for line in self._shards_of(split)
-            if line["first"] < count and tried_loads(line).stop > first
-        ]
+        parts = self._columns(split, first, count)
         number = np.concatenate([np.zeros(0, int), *(part["index"].numpy() for part in parts)])
-        rows = np.unique(number, return_index=True)[1]  # two writers may have solved the same load
+        # a load may be in two files if a writer was killed while it merged them
+        rows = np.unique(number, return_index=True)[1]
         rows = rows[(first <= number[rows]) & (number[rows] < count)]
         if not len(rows):
             raise DataSetError(f"{self.folder} holds no {split} samples")
@@ -159,65 +221,61 @@ class Store:
         )
         return Sample(force, displacement, self.scene.loads.young_at(point), parameters)
 
-    def _pending_columns(self, split: str, first: int, count: int) -> list[Columns]:
-        """Return the columns of the pending ones of loads `first` to `count` - 1."""
-        found = []
-        for job, path in self.pending.files().items():
-            if job.seed == self.stream(split) and first <= job.number < count:
-                with suppress(FileNotFoundError):  # its writer has moved it into a shard
-                    found.append(self.pending.read(path)[1])
-        return found
+    def _columns(self, split: str, first: int, count: int) -> list[Columns]:
+        """Return the columns of the shards with any of loads `first` to `count` - 1."""
+        while True:
+            found = []
+            with suppress(FileNotFoundError):  # another writer merges files: read them again
+                for shard in self.shards(split):
+                    if any(first <= number < count for number in shard.tried):
+                        found.append(self._undamaged(shard.path))
+                return found
 
-    def tried(self, split: str) -> set[int]:
-        """Return the loads of a split that have been tried, in shards or pending."""
-        # pending loads first, since another thread or process may move them into shards
-        pending = {job.number for job in self.pending.files() if job.seed == self.stream(split)}
-        return pending.union(*map(tried_loads, self._shards_of(split)))
-
-    def _read_shard(self, line: Mapping[str, Any]) -> Columns:
-        """Return the columns of a shard; raise DataSetError if it is damaged."""
+    def _undamaged(self, path: Path) -> Columns:
         try:
-            return self.read_shard(line)
+            return self.read(path)
         except ValueError as error:
             raise DataSetError(
-                f"{self.folder / line['file']} {error}; scripts/generate.py action=repair with the "
-                "same scene solves its loads again"
+                f"{path} {error}; scripts/generate.py action=repair with the same scene solves its "
+                "loads again"
             ) from None
 
-    def read_shard(self, line: Mapping[str, Any]) -> Columns:
-        """Return the columns of a shard; raise ValueError if it is damaged, see `decode_shard`."""
-        path = self.folder / line["file"]
-        if path.parent != self.folder:
-            raise ValueError("is not in the folder of the data set and is not read")
-        if path.is_symlink() or not path.is_file():
-            raise ValueError("is missing")
-        if path.stat().st_size > self.max_shard_size(line["tried"]):
-            raise ValueError("is damaged: it is larger than its loads")
-        content = path.read_bytes()
-        if hashlib.sha256(content).hexdigest() != line["sha256"]:
-            raise ValueError("is damaged: its SHA-256 differs from the manifest's")
-        shard = self.decode(content)
-        if shard["index"].tolist() != accepted_loads(line):
-            raise ValueError("holds other loads than its line of the manifest")
-        return shard
+    def write(self, solved: SolvedLoad) -> None:
+        """Write a solved load to a file of its own."""
+        (split,) = (name for name in STREAMS if self.stream(name) == solved.job.seed)
+        path = self.folder / f"{split}-{solved.job.number:06d}.safetensors"
+        point = torch.from_numpy(solved.point)[None]
+        columns = encode_load(solved, self.scene.loads.parameters_at(point))
+        # not synced: a file that a crash of the machine has damaged is not read
+        write_file(path, encode_shard(path.name, [columns]), sync=False)
+
+    def scattered(self, shard: int = 0, shards: int = 1) -> list[tuple[str, int]]:
+        """Return the blocks of a writer with more than one file, as split and number."""
+        names = filter(None, (SHARD_NAME.fullmatch(path.name) for path in self.files()))
+        count = Counter((name[1], int(name[2]) // SHARD_SIZE) for name in names)
+        return [key for key, files in count.items() if files > 1 and key[1] % shards == shard]
+
+    def merge(self, split: str, block: int) -> None:
+        """Merge the files of a block; leave them as they are if one of them is damaged."""
+        found = self.shards(split, block)
+        if len(found) < 2:
+            return
+        loads: dict[int, Columns] = {}
+        for shard in found:
+            try:
+                loads |= single_loads(self.read(shard.path))
+            except ValueError:
+                return
+        path = self.folder / f"{split}-{min(loads):06d}.safetensors"
+        write_file(path, encode_shard(path.name, [loads[number] for number in sorted(loads)]))
+        for shard in found:
+            if shard.path != path:
+                shard.path.unlink(missing_ok=True)
 
     def max_shard_size(self, loads: int) -> int:
         """Return the largest possible size of a shard of this many loads [bytes]."""
-        numbers = 3 * math.prod(self.scene.problem.shape) + self.scene.loads.n_random + 8
-        return HEADER + 8 * numbers * loads
-
-    def decode(self, content: bytes) -> Columns:
-        """Return the columns of a shard of this scene, see `decode_shard`."""
-        loads = self.scene.loads
-        shape, n_parameters = self.scene.problem.shape, len(loads.parameter_ranges)
-        return decode_shard(content, shape, loads.n_random, n_parameters)
-
-    def digest(self, split: str, count: int) -> str:
-        """Return the SHA-256 of the samples of a split; it does not depend on the shard size."""
-        found = hashlib.sha256()
-        for column in self.load(split, count)[:2]:
-            found.update(column.contiguous().numpy().tobytes())
-        return found.hexdigest()
+        numbers = 3 * math.prod(self.scene.problem.shape) + 2 * self.scene.loads.n_random + 16
+        return HEADER + (8 * numbers + REASON) * loads
 
     def modes(self) -> dict[str, Tensor]:
         """Return the stored `LoadFamily.arrays`; raise DataSetError if their file is damaged."""
@@ -234,53 +292,41 @@ class Store:
 
     def acceptance(self) -> list[AmplitudeBin]:
         """Return the numbers of tried and accepted loads by amplitude, over all splits."""
-        lines = self.shards()
-        amplitudes = [amplitude for line in lines for amplitude in line["amplitudes"]]
-        kept = (np.isin(tried_loads(line), accepted_loads(line)) for line in lines)
-        return amplitude_bins(amplitudes, np.concatenate([np.zeros(0, bool), *kept]).tolist())
+        shards = self.shards()
+        amplitudes = [value for shard in shards for value in shard.columns["amplitude"].tolist()]
+        return amplitude_bins(amplitudes, [one for s in shards for one in s.accepted.tolist()])
 
     def summary(self) -> str:
         """Return a table of tried and accepted loads, by split and by amplitude."""
         lines = [str(self.folder)]
         for split in STREAMS:
-            shards = self._shards_of(split)
-            tried, accepted, iterations = (
-                sum(line[key] for line in shards) for key in ("tried", "accepted", "iterations")
-            )
-            if tried:
+            shards = self.shards(split)
+            if tried := sum(len(shard.tried) for shard in shards):
+                accepted = sum(int(shard.accepted.sum()) for shard in shards)
+                iterations = sum(int(shard.columns["iterations"].sum()) for shard in shards)
                 lines.append(
                     f"  {split}: {accepted} of {tried} loads accepted, "
                     f"{iterations / tried:.1f} Newton iterations"
                 )
+        rejected = Counter(one for shard in self.shards() for one in reasons(shard.columns))
+        lines += [f"  {count} rejected: {reason}" for reason, count in sorted(rejected.items())]
         lines += [f"  {row}" for row in acceptance_table(self.acceptance())]
-        sessions = read_sessions(self.folder)
-        loads, wall, core = (
-            sum(one[key] for one in sessions) for key in ("loads", "seconds", "core_seconds")
-        )
+        sessions, loads, wall, core = totals(self.folder)
         if loads:
             size = sum(path.lstat().st_size for path in self.folder.glob("*.safetensors")) / 1e6
             lines.append(
                 f"  {core / loads:.3f} s per load on one core, {wall:.0f} s of wall time in "
-                f"{len(sessions)} sessions, {size:.0f} MB"
+                f"{sessions} sessions, {size:.0f} MB"
             )
         return "\n".join(lines)
 
     def seconds_per_load(self) -> float | None:
         """Return the mean wall time per load over all sessions [s]; None before the first one."""
-        sessions = read_sessions(self.folder)
-        loads = sum(one["loads"] for one in sessions)
-        return sum(one["seconds"] for one in sessions) / loads if loads else None
+        _, loads, seconds, _ = totals(self.folder)
+        return seconds / loads if loads else None
 
 
-def runs(numbers: Sequence[int]) -> Iterator[list[int]]:
-    """Yield the loads of each file, of `numbers` in ascending order.
-
-    They are consecutive and never across a multiple of SHARD_SIZE.
-    """
-    run: list[int] = []
-    for number in [*numbers, None]:
-        if run and (number is None or number != run[-1] + 1 or number % SHARD_SIZE == 0):
-            yield run
-            run = []
-        if number is not None:
-            run.append(number)
+def blocks(numbers: Iterable[int]) -> Iterator[tuple[int, list[int]]]:
+    """Yield the blocks of some loads in ascending order, each with its number and these loads."""
+    for block, members in groupby(numbers, lambda number: number // SHARD_SIZE):
+        yield block, list(members)
