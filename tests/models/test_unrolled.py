@@ -365,7 +365,7 @@ def test_errors_are_estimated_within_a_factor_and_never_far_below(beam):
     assert torch.equal(fields, net(unseen.force))
     ratio = estimated[:, 0] / errors(net, unseen)
     assert ratio.min() > 1 / 3
-    assert ratio.median() < 6
+    assert ratio.median() < 10
     with torch.enable_grad():
         _, tensors = net.forward_with_errors(unseen.force.clone().requires_grad_())
     assert torch.allclose(tensors, estimated, rtol=1e-3)
