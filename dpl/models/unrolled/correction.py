@@ -16,7 +16,7 @@ MAX_STEPS = 6  # also of the simulator
 LOADS = 50  # held-out loads by whose errors the number of modes is chosen
 SUFFICIENT = 2e-3  # largest relative error of these loads for which no more modes are tried [-]
 ERROR = 1e-5  # estimated relative error at which the steps end [-]
-RIDGES = (1.0, 10.0, 100.0, 1000.0)  # of exponents, in squares of logarithms
+RIDGE = 1.0  # of exponents, in squares of logarithms
 DEVIATIONS = 5.0  # standard deviations of a fitted error after which it is at least `LEAST`
 LEAST = 1 / 3  # smallest ratio of an estimated and a true error [-]
 
@@ -28,7 +28,7 @@ def fit_errors(sizes: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
     the logarithms of errors on those of sizes. Exponents are shrunk towards those of the root of
     the last correction over the linear coordinates. The factor is such that an error `DEVIATIONS`
     standard deviations above the regression is estimated at `LEAST` of it. The deviations are
-    leave-one-out residuals, which choose the ridge, too.
+    leave-one-out residuals.
 
     Source: Allen (1974), Technometrics 16 (leave-one-out residuals of a ridge regression).
 
@@ -42,14 +42,11 @@ def fit_errors(sizes: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
     prior[0], prior[-1] = -0.5, 0.5
     X = logs - logs.mean(dim=0)
     rest = target - target.mean() - X @ prior
-    deviation, exponents = torch.tensor(math.inf), prior
-    for ridge in RIDGES:
-        inverse = torch.linalg.inv(X.T @ X + ridge * torch.eye(len(prior)).double())
-        change = inverse @ (X.T @ rest)
-        leverage = 1 / len(X) + ((X @ inverse) * X).sum(dim=1)
-        left_out = ((rest - X @ change) / (1 - leverage).clamp(min=1e-3)).square().mean().sqrt()
-        if left_out < deviation:
-            deviation, exponents = left_out, prior + change
+    inverse = torch.linalg.inv(X.T @ X + RIDGE * torch.eye(len(prior)).double())
+    change = inverse @ (X.T @ rest)
+    leverage = 1 / len(X) + ((X @ inverse) * X).sum(dim=1)
+    left_out = (rest - X @ change) / (1 - leverage).clamp(min=1e-3)
+    deviation, exponents = left_out.square().mean().sqrt(), prior + change
     shift = (DEVIATIONS * deviation + math.log(LEAST)).clamp(min=0)
     return target.mean() - logs.mean(dim=0) @ exponents + shift, exponents
 
