@@ -1,11 +1,12 @@
 """Answers of the simulator and their summaries in words."""
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from torch import Tensor
+import torch
 
 from dpl.fem import Solution, Status
 from dpl.fem.loads.family import MAX_DISTANCE
@@ -24,10 +25,9 @@ class Answer:
         displacement: (N, D) [m], a NumPy array or a tensor as the force.
         residual: ||R_free|| / ||f||, evaluated at the displacement [-], see
             `Problem.relative_residual_of`.
-        error: Estimated relative error of the displacement [-], see `estimate_error`: no bound.
-            The estimate in the modes is that of a model which knows its error outside of them, such
-            as `unrolled`, under a load in range. Infinite if an element is inverted or the
-            prediction is not finite.
+        error: Estimated relative error of the displacement [-], see `estimate_error`: no bound. A
+            model that `HasCorrection`, such as `unrolled`, states it for loads in range. Infinite
+            if an element is inverted or the prediction is not finite.
         volume_ratio: min det F [-]; an element is inverted if it is not above 0.
         converged: True if the residual is below the tolerance of the call (without one, that of
             the scene) and no element is inverted. It is False also where rounding does not allow
@@ -119,18 +119,22 @@ def relative(error: float) -> str:
     return f"{100 * error:.2g} %" if error >= LEAST_PERCENTAGE else f"{error:.1e}"
 
 
-def answer_like(answer: dict[str, Any], *, numpy: bool, single: bool) -> Answer:
-    """Return the answer in NumPy or torch, for one load or several, as the force was given."""
-    for field in fields(Answer):
-        value = answer[field.name]
-        if single:
-            value = value[0]
-            if isinstance(value, Tensor) and value.ndim == 0:
-                value = value.item()
-        if isinstance(value, Tensor):
-            value = value.clone()  # an ordinary tensor, not one of inference
-            value = value.numpy() if numpy else value
-        elif numpy and isinstance(value, list):
-            value = np.array(value)
-        answer[field.name] = value
-    return Answer(**answer)
+def answer_of(rows: Sequence[tuple[Any, ...]], *, numpy: bool, single: bool) -> Answer:
+    """Return the answer to one load or several, in NumPy or torch as the force was given.
+
+    Args:
+        rows: Fields of `Answer` for each load: a tensor (N, D), then numbers and texts.
+        numpy: Return NumPy arrays.
+        single: Return the fields of the only load, without a leading axis.
+    """
+    displacements, *columns = zip(*rows, strict=True)
+    if single:
+        values = [column[0] for column in columns]
+    else:
+        values = [np.array(column) for column in columns]
+        if not numpy:
+            values = [torch.from_numpy(x) if x.dtype.kind != "U" else x.tolist() for x in values]
+    displacement = displacements[0] if single else torch.stack(displacements)
+    if numpy:
+        return Answer(displacement.numpy(), *values)
+    return Answer(displacement.clone(), *values)  # an ordinary tensor, not one of inference

@@ -114,26 +114,23 @@ def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
     if force.shape[-2:] != shape or force.ndim not in (2, 3) or not force.numel():
         words = f"({shape[0]}, {shape[1]}) or (B, {shape[0]}, {shape[1]})"
         raise ValueError(f"force: its shape is {tuple(force.shape)} and must be {words}")
-    force = force.reshape(-1, *shape)
-    if not force.abs().amax().isfinite():  # NaN if an entry is
+    force = scene.problem.acting(force.reshape(-1, *shape))
+    largest = force.flatten(1).abs().amax(dim=1)
+    if not largest.isfinite().all():  # NaN if an entry is, also at fixed degrees of freedom
         raise ValueError("force: a number is not finite")
     moduli = _moduli(scene, young, len(force))
     values = named_columns("parameters", parameters, list(scene.loads.parameter_ranges), len(force))
     own = scene.problem.law_parameters(values)
     scene.problem.material.with_parameters(own)  # refuses values that it does not allow
-    force = scene.problem.acting(force)
-    load = scene.load_of(force, moduli, values)
-    sizes = load.force.abs().amax(dim=(1, 2))
-    lost = sizes < FAINT
-    if lost.any():  # zero forces are not lost
-        lost &= force.flatten(1).any(dim=1)
-    if lost.any() or not sizes.isfinite().all():
+    sizes = largest / (moduli * scene.force_unit)
+    is_lost = (sizes < FAINT) & (largest > 0)
+    if is_lost.any() or not sizes.isfinite().all():
         unit = "E L^2" if shape[1] == 3 else "E L"
         raise ValueError(
             f"force: its largest entry over {unit} must be 0, or a number from {FAINT:g} that "
             "float64 holds; check the units of force and young"
         )
-    return load
+    return scene.load_of(force, moduli, values)
 
 
 def _moduli(scene: Scene, young: Any, count: int) -> Tensor:
@@ -141,7 +138,9 @@ def _moduli(scene: Scene, young: Any, count: int) -> Tensor:
     low, high = scene.loads.moduli
     if young is None and low < high:
         raise ValueError(f"young: the scene has a range, {low:g} to {high:g} Pa; say which")
-    moduli = per_load("young", low if young is None else young, count)
+    if young is None:
+        return torch.full((count,), low, dtype=torch.float64)
+    moduli = per_load("young", young, count)
     if not (moduli > 0).all():
         raise ValueError("young: a modulus is not above 0 Pa")
     for modulus in moduli.tolist():

@@ -367,9 +367,9 @@ class Gripper:
         nodal, error = body.patch.at(held.force), held.known_error
         wrench = body.patch.wrench(nodal, state.displacement[0])
         force_error, moment_error = body.wrench_errors(held)
-        place = RangeCheck.of(self.surrogate, load._replace(force=load.force + nodal))
-        amplitude, out_of_span = float(place.amplitude), float(place.out_of_span)
-        outside = bool(place.outside) and not error < UNRELIABLE
+        (place,) = RangeCheck.of(self.surrogate, load._replace(force=load.force + nodal))
+        amplitude, out_of_span, outside = place
+        outside = outside and not error < UNRELIABLE
         words = summarise(state, held.is_exact, error, amplitude, out_of_span, outside)
         words += f"; force within about {relative(force_error)}, moment {relative(moment_error)}"
         if request.spent:

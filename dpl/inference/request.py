@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 
 from torch import Tensor
 
-from dpl.fem import Solution
+from dpl.fem import Load, Problem, Solution, evaluate_solution
 from dpl.fem.problem import Evaluation
 from dpl.fem.solvers import check_tol
 from dpl.fem.solvers.error_estimate import PRODUCTS
@@ -15,6 +15,21 @@ from dpl.inference.arguments import as_number
 from dpl.scene import Scene
 
 EXACT = 1e-12  # error of a motion that counts as met exactly [-]
+SUFFICIENT = 2e-3  # estimated relative error above which predictions are corrected [-]
+
+
+class Guess(NamedTuple):
+    """A displacement with its known errors.
+
+    Attributes:
+        displacement: (1, N, D) [-].
+        error: Its relative error, calibrated on held-out loads [-]; infinite: unknown.
+        error_outside: The relative error that steps in the modes leave, likewise [-].
+    """
+
+    displacement: Tensor
+    error: float = math.inf
+    error_outside: float = math.inf
 
 
 class Candidate(NamedTuple):
@@ -43,6 +58,26 @@ class Candidate(NamedTuple):
     evaluation: Evaluation | None = None
     motion_error: float = 0.0
     force: Tensor | None = None
+
+    @classmethod
+    def evaluated(
+        cls,
+        method: str,
+        problem: Problem,
+        displacement: Tensor,
+        load: Load,
+        tol: float,
+        iterations: int = 0,
+        evaluation: Evaluation | None = None,
+    ) -> Self:
+        """Return a displacement as a solution, with its evaluation if that is not known."""
+        if evaluation is None:
+            evaluation = problem.with_parameters(load.parameters).evaluate(displacement)
+        state = evaluate_solution(
+            problem, displacement, load, tol, iterations=iterations,
+            from_guess=method in ("prediction", "corrected"), evaluation=evaluation,
+        )  # fmt: skip
+        return cls(method, state, evaluation=evaluation)
 
     @property
     def is_exact(self) -> bool:
@@ -93,6 +128,11 @@ class Request:
         if budget_ms is not None and not 0 < budget_ms < math.inf:
             raise ValueError(f"budget_ms = {budget_ms} must be a number above 0")
         return cls(tol, budget_ms, error, warm)
+
+    @property
+    def sufficient_error(self) -> float:
+        """Estimated relative error up to which a prediction is not corrected [-]."""
+        return SUFFICIENT if self.error is None else self.error
 
     @property
     def is_more_than_prediction(self) -> bool:

@@ -13,28 +13,25 @@ from torch import Tensor
 
 from dpl.fem import (
     Load,
-    Problem,
     Solution,
     Status,
     SubspaceNewton,
     estimate_error,
     evaluate_solution,
 )
-from dpl.fem.solvers import concatenate
 from dpl.fem.solvers.error_estimate import MANY_PRODUCTS, PRODUCTS
-from dpl.inference.answer import Answer, answer_like, summarise
+from dpl.inference.answer import Answer, answer_of, summarise
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.grasp import Gripper
 from dpl.inference.hybrid import default_hybrid
-from dpl.inference.request import Candidate, Request
+from dpl.inference.request import Candidate, Guess, Request
 from dpl.inference.training_range import RangeCheck
 from dpl.models.unrolled.correction import MAX_STEPS
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import TrainedSurrogate
 
-SUFFICIENT = 2e-3  # steps leave an error of 1e-3 in the modes, and about as much outside [-]
-ERROR = 1e-3  # estimated relative error above which they are made [-]
+ERROR = 1e-3  # estimated relative error in the modes at which the steps end [-]
 POOR_STREAM = 9_003  # of the loads by which the predictions are judged
 PACE_DECAY = 0.9  # of a time from call to call
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
@@ -46,12 +43,12 @@ class Simulator:
     """Simulator of a scene with a trained surrogate and the solvers of the scene.
 
     Called with a force alone, it returns the prediction with its residual and its estimated error.
-    If the model comes with Newton's method in its modes, it makes steps of this method while the
-    error in the modes is too large, and a correction of the whole and further steps if the
-    estimated error is too large then. With a tolerance for the residual or the estimated error, it
-    tries network, linear solution, hybrid and Newton in this order until the tolerance is met; with
-    a budget, while there is time. It keeps the last displacement as an initial guess of the next
-    call (`warm`).
+    If that is too large and the model comes with Newton's method in its modes, it makes steps of
+    this method while the error in the modes is too large, and a correction of the whole and further
+    steps if the estimated error is too large then. With a tolerance for the residual or the
+    estimated error, it tries network, linear solution, hybrid and Newton in this order until the
+    tolerance is met; with a budget, while there is time. It keeps the last displacement as an
+    initial guess of the next call (`warm`).
 
     Attributes:
         surrogate: The surrogate.
@@ -123,8 +120,8 @@ class Simulator:
             budget_ms: Wall time of each load [ms]. An iteration is not started if the time of the
                 last iteration exceeds the rest of the budget.
             error: Estimated relative error of the result [-]. The prediction of a model with modes
-                is corrected first, by at most `steps` steps, while its error is above `error`; it
-                also is if `error` is left out, with 1e-3 in the modes and 2e-3 in the whole.
+                is corrected first, by at most `steps` steps, while its error is above `error`, or
+                above 2e-3 if `error` is left out.
             warm: Start from the last displacement if it is nearer to equilibrium than the
                 prediction.
             stability: Factorise the tangent at the result to determine its stability.
@@ -138,80 +135,72 @@ class Simulator:
         load = as_load(self.scene, given, young, parameters)
         request = Request.checked(tol, budget_ms, error, warm=warm)
         with one_thread(), torch.inference_mode():
-            skipped = request.skips_poor_predictions and self._is_poor
-            predictions = [None] * len(load.force)
-            if not skipped:
-                predictions = self.surrogate.predict(load).split(1)
             places = RangeCheck.of(self.surrogate, load)
+            guesses: Sequence[Guess | None] = [None] * len(load.force)
+            if not (request.skips_poor_predictions and self._is_poor):
+                guesses = self._guesses(load, places)
             shared = (time.perf_counter() - begin) / len(load.force)
-            found = []
-            members = load.unbatch(), predictions, places.split()
-            for single, prediction, place in zip(*members, strict=True):
+            rows = []
+            for single, guess, place in zip(load.unbatch(), guesses, places, strict=True):
                 begin = time.perf_counter() - shared
                 own = replace(request, begin=begin, products=self._products(place, request))
-                best = self._solve(single, prediction, place, own)
+                best = self._solve(single, guess, place, own)
                 if stability:
                     best = best._replace(state=self._with_stability(single, best.state))
                 self._before = single.parameters, best.state.displacement
-                found.append((best, 1e3 * (time.perf_counter() - begin)))
-            answer = self._reported(found, places, request)
-        return answer_like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
+                taken = 1e3 * (time.perf_counter() - begin)
+                rows.append(self._row(best, place, request, taken))
+        return answer_of(rows, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
 
     def prediction_error(self, load: Load, prediction: Tensor) -> float:
         """Return the estimated relative error that a call states for a prediction (1, N, D) [-].
 
         `load` has B = 1. The prediction may contain steps in the modes.
         """
-        place, request = RangeCheck.of(self.surrogate, load), Request(None, None, None, warm=False)
-        own = replace(request, products=self._products(place, request))
-        candidate = self._in_modes(load, prediction, place, own, taken=self.steps)
-        return self._with_error(load, candidate, own).known_error
+        (place,) = RangeCheck.of(self.surrogate, load)
+        request = Request(None, None, None, warm=False)
+        request.products = self._products(place, request)
+        with torch.inference_mode():
+            (guess,) = self._guesses(load, [place])
+            if not torch.equal(guess.displacement, prediction):
+                guess = Guess(prediction, error_outside=guess.error_outside)
+            candidate = self._in_modes(load, guess, request, taken=self.steps)
+            return self._with_error(load, candidate, request).known_error
 
     @cached_property
     def grasp(self) -> Gripper:
         """The gripper of the body, called as `sim.grasp(region, translation, rotation)`."""
         return Gripper(self.surrogate, steps=self.steps)
 
-    def _reported(
-        self,
-        found: Sequence[tuple[Candidate, float]],
-        places: RangeCheck,
-        request: Request,
-    ) -> dict[str, Any]:
-        """Return the fields of `Answer` for solutions with their times [ms]."""
-        state = concatenate([best.state for best, _ in found])
-        wanted = request.residual_tol(self.scene)
-        kept = state.converged & (state.residual < wanted)
-        errors = [best.known_error for best, _ in found]
-        numbers = zip(kept.tolist(), errors, *(column.tolist() for column in places), strict=True)
-        words = [
-            "no load: at rest" if best.method == "rest" else summarise(best.state, *own)
-            for (best, _), own in zip(found, numbers, strict=True)
-        ]
-        return {
-            "displacement": self.scene.length * state.displacement,
-            "residual": state.residual,
-            "error": torch.tensor(errors, dtype=torch.float64),
-            "volume_ratio": state.volume_ratio,
-            "converged": kept,
-            "negative_pivots": state.negative_pivots,
-            "amplitude": places.amplitude,
-            "out_of_span": places.out_of_span,
-            "out_of_distribution": places.outside,
-            "method": [best.method for best, _ in found],
-            "iterations": state.iterations,
-            "milliseconds": torch.tensor([taken for _, taken in found], dtype=torch.float64),
-            "summary": words,
-        }
+    def _guesses(self, load: Load, places: Sequence[RangeCheck]) -> list[Guess]:
+        """Return the predictions; their estimated errors are known in range only."""
+        predictions, errors = self.surrogate.predict_with_errors(load)
+        rows = zip(predictions.split(1), errors.tolist(), places, strict=True)
+        return [Guess(u, *own) if place.inside else Guess(u) for u, own, place in rows]
+
+    def _row(
+        self, best: Candidate, place: RangeCheck, request: Request, milliseconds: float
+    ) -> tuple[Any, ...]:
+        """Return the fields of `Answer` for one load."""
+        state, error = best.state, best.known_error
+        residual, converged = float(state.residual), bool(state.converged)
+        kept = converged and residual < request.residual_tol(self.scene)
+        words = "no load: at rest"
+        if best.method != "rest":
+            words = summarise(state, kept, error, *place)
+        displacement = self.scene.length * state.displacement[0]
+        numbers = residual, error, float(state.volume_ratio), kept, int(state.negative_pivots)
+        counts = best.method, int(state.iterations), milliseconds
+        return (displacement, *numbers, *place, *counts, words)
 
     def _solve(
-        self, load: Load, prediction: Tensor | None, place: RangeCheck, request: Request
+        self, load: Load, guess: Guess | None, place: RangeCheck, request: Request
     ) -> Candidate:
         """Return the first solution that meets the tolerances, else the best one.
 
         Args:
             load: The load, B = 1.
-            prediction: The prediction of the network, (1, N, D) [-]; None if it is not tried.
+            guess: The prediction of the network; None if it is not tried.
             place: Position of the load relative to the training range.
             request: Options of the call.
         """
@@ -221,7 +210,7 @@ class Simulator:
             return Candidate("rest", rest, 0.0)
         best: Candidate | None = None
         last: Candidate | None = None
-        for last in self._candidates(load, prediction, place, request):
+        for last in self._candidates(load, guess, place, request):
             if request.error is not None:
                 last = self._with_error(load, last, request)
             if best is None or request.rank(last) <= request.rank(best):
@@ -251,14 +240,14 @@ class Simulator:
     def _with_error(self, load: Load, candidate: Candidate, request: Request) -> Candidate:
         """Return a solution with its estimated error.
 
-        The error in the modes and the known one outside of them are the estimate if their sum is at
-        most the requested one, or `SUFFICIENT`. Otherwise it is the larger one of the error in the
-        modes and of `estimate_error`.
+        The error in the modes and the known one outside of them are the estimate if their sum is
+        sufficient. Otherwise it is the larger one of the error in the modes and of
+        `estimate_error`.
         """
+        known = candidate.error_in_modes + candidate.error_outside
         if candidate.error is not None:
             return candidate
-        known = candidate.error_in_modes + candidate.error_outside
-        if known <= (SUFFICIENT if request.error is None else request.error):
+        if known <= request.sufficient_error:
             return candidate._replace(error=known)
         begin, state = time.perf_counter(), candidate.state
         found = estimate_error(
@@ -272,7 +261,7 @@ class Simulator:
         return candidate._replace(state=state, error=error, correction=found.correction)
 
     def _candidates(
-        self, load: Load, prediction: Tensor | None, place: RangeCheck, request: Request
+        self, load: Load, guess: Guess | None, place: RangeCheck, request: Request
     ) -> Iterator[Candidate]:
         """Yield the solutions of the methods, the cheapest first; see `_solve`.
 
@@ -283,19 +272,19 @@ class Simulator:
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
         self._pace = self._first_pace
         starts = []
-        if prediction is not None:
-            for first in self._predictions(load, prediction, place, request):
+        if guess is not None:
+            for first in self._predictions(load, guess, request):
                 yield first  # the last one is the best
             if not request.is_more_than_prediction:
                 return
             starts.append(first)
         clock = time.perf_counter()
         if request.warm and self._before and torch.equal(self._before[0], load.parameters):
-            starts.append(_evaluated("last", problem, self._before[1], load, tol))
+            starts.append(Candidate.evaluated("last", problem, self._before[1], load, tol))
         distances = [self._distance(load, one) for one in starts]
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
             linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
-            yield _evaluated("linear", problem, linear, load, tol)
+            yield Candidate.evaluated("linear", problem, linear, load, tol)
         start = None
         if (least := min(distances, default=math.inf)) <= FAR:
             start = starts[distances.index(least)].state.displacement
@@ -322,86 +311,77 @@ class Simulator:
         Newton's method from rest is faster than it is to try such predictions.
         """
         problem, tol = self.scene.problem, self.scene.solver.tol
-        return all(
-            not self._distance(
-                load, _evaluated("prediction", problem, self.surrogate.predict(load), load, tol)
-            )
-            <= FAR
-            for load in self.scene.loads.sample((0, POOR_STREAM), range(3)).unbatch()
-        )
+        loads = self.scene.loads.sample((0, POOR_STREAM), range(3)).unbatch()
+        predictions = map(self.surrogate.predict, loads)
+        found = [
+            Candidate.evaluated("prediction", problem, u, load, tol)
+            for load, u in zip(loads, predictions, strict=True)
+        ]
+        return not any(self._distance(*pair) <= FAR for pair in zip(loads, found, strict=True))
 
     def _distance(self, load: Load, candidate: Candidate) -> float:
-        """Return the estimated relative error of a start [-].
-
-        A known error of up to `FAR` in and outside of the modes needs no further estimate.
-        """
-        if candidate.error is not None:
-            return candidate.error
-        known = candidate.error_in_modes + candidate.error_outside
-        if known <= FAR:
-            return known
+        """Return the estimated relative error of a start [-]; one up to `FAR` may be rough."""
         products = 0 if self.scene.is_compact else MANY_PRODUCTS
-        return estimate_error(
-            self.scene.linear, load, candidate.state.displacement, candidate.evaluation,
-            products=products,
-        ).error  # fmt: skip
+        rough = Request(None, None, FAR, warm=False, products=products)
+        return self._with_error(load, candidate, rough).known_error
 
-    def _predictions(
-        self, load: Load, prediction: Tensor, place: RangeCheck, request: Request
-    ) -> Iterator[Candidate]:
+    def _predictions(self, load: Load, guess: Guess, request: Request) -> Iterator[Candidate]:
         """Yield the prediction after steps in the modes, then corrections of it where they help.
 
         A correction is that of `estimate_error`, which reduces the error outside the modes, then
         steps in the modes, which reduce the error that it adds there. Corrections follow while the
         estimated error is too large and decreases.
         """
-        last = self._in_modes(load, prediction, place, request)
+        last = self._in_modes(load, guess, request)
         if request.error is not None or (self.newton is not None and request.is_for_error):
             last = self._with_error(load, last, request)
         yield last
         if self.newton is None:
             return
-        sufficient = SUFFICIENT if request.error is None else request.error
-        while last.correction is not None and last.known_error > sufficient:
+        while last.correction is not None and last.known_error > request.sufficient_error:
             taken = int(last.state.iterations) + 1
             if taken > self.steps or request.over(2 * self._estimate_time):
                 return
-            guess = last.state.displacement + last.correction
-            following = self._in_modes(load, guess, place, request, taken=taken)
+            u = last.state.displacement + last.correction
+            corrected = Guess(u, error_outside=guess.error_outside)
+            following = self._in_modes(load, corrected, request, taken=taken)
             following = self._with_error(load, following, request)
             if not following.known_error < last.known_error:
                 return
             yield (last := following)
 
-    def _in_modes(
-        self, load: Load, guess: Tensor, place: RangeCheck, request: Request, *, taken: int = 0
-    ) -> Candidate:
-        """Return a displacement after Newton's steps in the modes; `taken` steps precede them."""
+    def _in_modes(self, load: Load, guess: Guess, request: Request, *, taken: int = 0) -> Candidate:
+        """Return a displacement after Newton's steps in the modes; `taken` steps precede them.
+
+        No step is made where the known error is sufficient, or if none is left.
+        """
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
-        if self.newton is None or not guess.abs().amax().isfinite():
-            return _evaluated("prediction", problem, guess, load, tol)
-        wanted = ERROR if request.error is None else request.error
-        begin, pace = time.perf_counter(), 0.0
+        if self.newton is None:
+            return Candidate.evaluated("prediction", problem, guess.displacement, load, tol)
+        begin, method = time.perf_counter(), "corrected" if taken else "prediction"
+        first = Candidate.evaluated(method, problem, guess.displacement, load, tol, taken)
+        if not first.state.residual.isfinite():
+            return first
+        in_range = bool((first.state.volume_ratio > 0) & (first.state.residual < MAX_RESIDUAL))
+        enough = request.sufficient_error if taken < self.steps else FAR
+        if in_range and guess.error <= enough:
+            return first._replace(error=guess.error)
+        wanted, pace = ERROR if request.error is None else request.error, 0.0
         states = self.newton.states(
-            load, guess=guess, error_tol=wanted, max_iter=self.steps - taken,
-            is_over=lambda: request.over(pace + self._estimate_time),
+            load, guess=guess.displacement, evaluation=first.evaluation, error_tol=wanted,
+            max_iter=self.steps - taken, is_over=lambda: request.over(pace + self._estimate_time),
         )  # fmt: skip
-        first = next(states)
+        state = next(states)
         pace = time.perf_counter() - begin  # each step evaluates and corrects like this
-        *_, state = first, *states
-        solution = evaluate_solution(
-            problem, state.displacement, load, tol,
-            iterations=taken + state.iterations, from_guess=True, evaluation=state.evaluation,
-        )  # fmt: skip
-        outside = self.newton.outside_error  # 0 if it is not known
-        in_range = bool(place.inside & (solution.residual < MAX_RESIDUAL))
-        return Candidate(
-            "corrected" if taken + state.iterations else "prediction",
-            solution,
-            error_in_modes=state.error,
-            error_outside=outside if outside > 0 and in_range else math.inf,
-            evaluation=state.evaluation,
-        )
+        *_, state = state, *states
+        if state.iterations:
+            iterations = taken + state.iterations
+            evaluation = state.evaluation
+            first = Candidate.evaluated(
+                "corrected", problem, state.displacement, load, tol, iterations, evaluation
+            )
+        outside = guess.error_outside if first.state.residual < MAX_RESIDUAL else math.inf
+        return first._replace(error_in_modes=state.error, error_outside=outside)
 
     def _with_stability(self, load: Load, state: Solution) -> Solution:
         """Return a solution with the number of negative eigenvalues of its tangent."""
@@ -414,14 +394,3 @@ class Simulator:
             negative_pivots=torch.full_like(state.negative_pivots, pivots),
             status=torch.full_like(state.status, int(status)),
         )
-
-
-def _evaluated(
-    method: str, problem: Problem, displacement: Tensor, load: Load, tol: float
-) -> Candidate:
-    """Return a displacement as a solution, with its evaluation."""
-    evaluation = problem.with_parameters(load.parameters).evaluate(displacement)
-    state = evaluate_solution(
-        problem, displacement, load, tol, from_guess=method == "prediction", evaluation=evaluation
-    )
-    return Candidate(method, state, evaluation=evaluation)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numba import njit
 from numpy.linalg import norm
 from numpy.typing import NDArray
 from torch import Tensor
@@ -27,9 +28,57 @@ from dpl.scene import Scene
 from dpl.system.threads import on_threads
 
 Array = NDArray[np.float64]
+Parts = NDArray[Any]  # values by parity in the type of the blocks, (M, m)
 MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are float32 [-]
 FEW = 8  # loads that compiled loops solve faster than products of matrices do
 MAX_VALUES = 2**26  # of a batch that are computed at a time by tensor operations
+
+
+class OrbitArrays(NamedTuple):
+    """Degrees of freedom by parity p and symmetry g, see `dpl.fem.parity`.
+
+    Attributes:
+        characters: Factor of parity p under symmetry g, (M, M).
+        dofs: Images of one degree of freedom of each of m orbits, (M, m).
+        signs: Factors of these images, (M, m).
+        scales: The same times the weights of the orbits, (M, m).
+    """
+
+    characters: Array
+    dofs: NDArray[np.int64]
+    signs: Array
+    scales: Array
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
+def split_force(orbits, force, support, parts):  # type: ignore[no-untyped-def]
+    """Set parts (M, m) to f - s over a unit by parity, and return this unit.
+
+    The unit is the largest entry, so that parts in float32 neither underflow nor overflow.
+
+    Args:
+        orbits: See `OrbitArrays`.
+        force: f, (N D,).
+        support: s by parity, (M, m).
+        parts: (M, m).
+    """
+    M, m = orbits.dofs.shape
+    whole, own, unit = -support, np.empty(m), 0.0
+    for g in range(M):
+        for j in range(m):
+            own[j] = orbits.scales[g, j] * force[orbits.dofs[g, j]]
+        for p in range(M):
+            factor = orbits.characters[p, g]
+            for j in range(m):
+                whole[p, j] += factor * own[j]
+    for p in range(M):
+        for j in range(m):
+            unit = max(unit, abs(whole[p, j]))
+    unit = unit if unit > 0.0 else 1.0
+    for p in range(M):
+        for j in range(m):
+            parts[p, j] = whole[p, j] / unit
+    return unit
 
 
 class LinearResponse:
@@ -67,7 +116,8 @@ class LinearResponse:
         return StiffnessTerms.of(replace(problem, follower_loads=problem.follower_loads.constant))
 
     @cached_property
-    def _form(self) -> OrbitForm:
+    def form(self) -> OrbitForm:
+        """Values of each orbit of degrees of freedom, by which K(0) is stored."""
         return OrbitForm.of(self._scene.problem.reference, self._group)
 
     @cached_property
@@ -76,60 +126,75 @@ class LinearResponse:
 
         They are float64 if the solutions of random forces lose more than `MAX_ROUNDING`.
         """
-        matrices = self._form.matrices(node_body(self.terms, self.iteration))
-        exact = condense(matrices, self._form.points)
+        matrices = self.form.matrices(node_body(self.terms, self.iteration))
+        exact = condense(matrices, self.form.points)
         rounded = exact._replace(values=exact.values.astype(np.float32))
         return rounded if _difference(rounded, exact) < MAX_ROUNDING else exact
 
     @cached_property
     def _matrices(self) -> TermMatrices:
-        return TermMatrices.of(self.terms, self._form, self.iteration)
+        return TermMatrices.of(self.terms, self.form, self.iteration)
 
     @cached_property
     def _supports(self) -> Tensor:
         """Forces of `StiffnessTerms.support_forces` by parity, (T + 1, M m)."""
         forces = self.terms.support_forces()[:, self._scene.problem.free.cpu()]
-        return torch.stack([self._form.parts(force).flatten() for force in forces])
+        return torch.stack([self.form.parts(force).flatten() for force in forces])
 
     # ------------------------------------------------------------------ one load
 
-    def parts(self, force: Array) -> Array:
-        """Return a force (N, D) by parity, (M, m), see `OrbitForm`."""
-        dofs, scales, characters = self._arrays
-        return characters @ (scales * force.reshape(-1)[dofs])
-
     @cached_property
-    def _arrays(self) -> tuple[NDArray[np.int64], Array, Array]:
-        """Degrees of freedom of the orbits and their factors, (M, m), and the characters."""
-        parities, orbits, _ = self._form
+    def orbits(self) -> OrbitArrays:
+        """Degrees of freedom of the orbits for compiled loops."""
+        parities, orbits, _ = self.form
         dofs = self._scene.problem.free.flatten().nonzero()[:, 0].numpy()
-        scales = (orbits.sign * orbits.weight).numpy()
-        return dofs[orbits.images.numpy()], scales, parities.characters.numpy()
+        signs = orbits.sign.numpy()
+        scales = signs * orbits.weight.numpy()
+        return OrbitArrays(parities.characters.numpy(), dofs[orbits.images.numpy()], signs, scales)
 
-    def at(self, law: Material) -> Callable[[Array], Array]:
-        """Return the function from forces to linear solutions, by parity, (M, m) each.
+    def at(self, law: Material) -> Callable[[Array], tuple[float, Parts, Parts]]:
+        """Return the function from forces f (N, D) to linear solutions.
+
+        It returns a unit and, over this unit and by parity, f - s and K(0)^-1 (f - s), (M, m).
 
         Args:
             law: A law of the scene without ranges.
         """
         factors = np.append(self.terms.factors(law)[0].numpy(), 1.0)
-        inverse, support = self._inverse(factors), factors @ self._supports.numpy()
-        return lambda parts: inverse(parts.ravel() - support).reshape(parts.shape)
+        inverse, orbits = self._inverse(factors), self.orbits
+        support = (factors @ self._supports.numpy()).reshape(orbits.dofs.shape)
 
-    def _inverse(self, factors: Array) -> Callable[[Array], Array]:
-        """Return the function f (M m,) -> K(0)^-1 f of factors and 1, (T + 1,)."""
+        def solve(force: Array) -> tuple[float, Parts, Parts]:
+            parts = np.empty(support.shape, self.blocks.values.dtype)
+            unit = split_force(orbits, force.reshape(-1), support, parts)
+            return unit, parts, inverse(parts)
+
+        return solve
+
+    def _inverse(self, factors: Array) -> Callable[[Parts], Parts]:
+        """Return f -> K(0)^-1 f, (M, m) each, of factors and 1, (T + 1,); f is of order one."""
         (table, unknowns, _), values = self.blocks
+        shape = self.orbits.dofs.shape
 
-        def of_node(right: Array) -> Array:
-            forces = right.reshape(len(values), -1).copy()
-            found = np.empty_like(forces)
-            condensed_solves(table, unknowns, values, forces, found)
-            return found.ravel()
+        def of_node(parts: Parts) -> Parts:
+            found = np.empty_like(parts)
+            condensed_solves(table, unknowns, values, parts.copy(), found)
+            return found
 
         if not self.iteration.varies:
             return of_node
         matrix, ends = self._matrices.at(factors), (self.iteration.rtol, self.iteration.max_steps)
-        return lambda f: conjugate_gradients(matrix.dot, of_node, f, *ends, natural=True)
+
+        def precondition(residual: Array) -> Array:
+            found = of_node(residual.reshape(shape).astype(values.dtype))
+            return found.astype(np.float64).ravel()
+
+        def solve(parts: Parts) -> Parts:
+            right = parts.astype(np.float64).ravel()
+            found = conjugate_gradients(matrix.dot, precondition, right, *ends, natural=True)
+            return found.reshape(shape).astype(values.dtype)
+
+        return solve
 
     # ------------------------------------------------------------------ batches
 
@@ -164,9 +229,11 @@ class LinearResponse:
         many = right.shape[0] > FEW and not self.iteration.varies  # which need no steps
         if right.device.type != "cpu" or many:
             return self.by_tensors(right, factors)
-        rows = list(zip(right.numpy(), factors.numpy(), strict=True))
+        size, shape = _largest(right), self.orbits.dofs.shape
+        parts = (right / size).numpy().reshape(-1, *shape).astype(self.blocks.values.dtype)
+        rows = list(zip(parts, factors.numpy(), strict=True))
         found = on_threads(lambda row: self._inverse(row[1])(row[0]), rows)
-        return torch.from_numpy(np.stack(found)) if found else torch.empty_like(right)
+        return size * torch.from_numpy(np.stack(found)).flatten(1) if found else right.clone()
 
     def by_tensors(self, right: Tensor, factors: Tensor) -> Tensor:
         """Return the same as `solve` by tensor operations."""
@@ -186,8 +253,7 @@ class LinearResponse:
             return own.layers.solve(forces).transpose(0, 1).flatten(1).double()
 
         if not self.iteration.varies:
-            size = right.abs().amax(dim=1, keepdim=True)
-            size = torch.where(size > 0, size, 1.0)  # of order one, so that float32 holds it
+            size = _largest(right)
             return of_node(right / size) * size
         matrix = torch.einsum("bk,knw->bnw", factors, own.entries)
 
@@ -204,7 +270,7 @@ class LinearResponse:
 
     def _orbits(self, device: torch.device) -> "_Orbits":
         if device not in self._orbits_on:
-            parities, orbits, _ = self._form
+            parities, orbits, _ = self.form
             places = torch.empty(int(orbits.images.max()) + 1, dtype=torch.int64)
             places[orbits.images.flatten()] = torch.arange(orbits.images.numel())
             scales = orbits.sign * orbits.weight
@@ -270,11 +336,19 @@ class _Solve(Function):
         return right, of_factors, None
 
 
+def _largest(right: Tensor) -> Tensor:
+    """Return the largest entries (B, 1) of rows, over which float32 holds them; 1 of zeros."""
+    size = right.abs().amax(dim=1, keepdim=True)
+    return torch.where(size > 0, size, 1.0)
+
+
 def _difference(blocks: Condensed, exact: Condensed) -> float:
     """Return the largest relative difference of solutions of random forces [-]."""
     shape = len(exact.values), len(np.unique(exact.fronts.unknowns))
-    random, found = np.random.default_rng(0).standard_normal(shape), np.empty((2, *shape))
-    for one, solutions in zip((blocks, exact), found, strict=True):
+    random, found = np.random.default_rng(0).standard_normal(shape), []
+    for one in (blocks, exact):
         table, unknowns, _ = one.fronts
-        condensed_solves(table, unknowns, one.values, random.copy(), solutions)
+        forces = random.astype(one.values.dtype)
+        condensed_solves(table, unknowns, one.values, forces, solutions := np.empty_like(forces))
+        found.append(solutions.astype(np.float64))
     return float((norm(found[0] - found[1], axis=1) / norm(found[1], axis=1)).max())

@@ -51,7 +51,17 @@ class ClosedFormFit(Protocol):
 
 
 class HasCorrection(Protocol):
-    """A model whose fit includes Newton's method in its modes."""
+    """A model whose fit includes Newton's method in its modes and estimates of its errors."""
+
+    def forward_with_errors(
+        self, force: Tensor, parameters: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return displacements over L (B, N, D) and their estimated relative errors (B, 2) [-].
+
+        The second error is that which Newton's method leaves. Both are calibrated on held-out loads
+        and valid in the range of the training only.
+        """
+        ...
 
     def correction(self) -> SubspaceNewton | None:
         """Return Newton's method in the modes; None before the fit."""

@@ -38,13 +38,15 @@ def blas() -> ThreadpoolController:
 @contextmanager
 def limited_threads(count: int) -> Iterator[None]:
     """Let torch and BLAS use `count` threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    pools = [(pool, pool.get_num_threads()) for pool in (torch, *blas().lib_controllers)]
+    changed = [(pool, before) for pool, before in pools if before != count]
+    for pool, _ in changed:
+        pool.set_num_threads(count)
     try:
-        with blas().limit(limits=count):
-            yield
+        yield
     finally:
-        torch.set_num_threads(before)
+        for pool, before in changed:
+            pool.set_num_threads(before)
 
 
 def one_thread() -> AbstractContextManager[None]:

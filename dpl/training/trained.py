@@ -1,5 +1,6 @@
 """A surrogate without its training; this module does not import Lightning, which takes seconds."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -9,6 +10,7 @@ from torch import Tensor, nn
 from dpl.fem import Load
 from dpl.models.inputs import Base
 from dpl.models.linear_base import SCALE_STREAM
+from dpl.models.protocols import HasCorrection
 from dpl.scene import Scene
 from dpl.training.predictors import predictor_of
 
@@ -53,6 +55,17 @@ class TrainedSurrogate(nn.Module):
     def predict(self, load: Load) -> Tensor:
         """Return displacements over L, (B, N, D) [-], float64."""
         return cast(Tensor, self.predictor(load))
+
+    def predict_with_errors(self, load: Load) -> tuple[Tensor, Tensor]:
+        """Return `predict` and its estimated relative errors, (B, 2) [-], see `HasCorrection`.
+
+        They are infinite for a network that does not estimate them.
+        """
+        if not hasattr(self.net, "forward_with_errors"):
+            displacement = self.predict(load)
+            return displacement, displacement.new_full((len(displacement), 2), math.inf)
+        parameters = self.predictor.parameters_of(load)
+        return cast(HasCorrection, self.net).forward_with_errors(load.force, parameters)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
         """Load weights; the arguments are those of `torch.nn.Module`.

@@ -139,9 +139,8 @@ def placed(loads, force):
     predictor = SimpleNamespace(reads_young=False)
     surrogate = SimpleNamespace(scene=SimpleNamespace(loads=loads), predictor=predictor)
     load = loads.sample(0, [0] * len(force))._replace(force=force)
-    place = RangeCheck.of(surrogate, load)
-    found = zip(place.outside.tolist(), place.is_known.tolist(), strict=True)
-    return {"out" if outside else "in" if known else "unknown" for outside, known in found}
+    places = RangeCheck.of(surrogate, load)
+    return {"out" if one.outside else "in" if one.inside else "unknown" for one in places}
 
 
 PUSH = partial(fem.FacePressure, region=END, pressure=[10.0, 30.0])

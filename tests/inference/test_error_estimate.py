@@ -34,10 +34,19 @@ def simulator_of(scene, part, **more):
     return Simulator(surrogate, **more)
 
 
-def softest_mode(scene, **options):
+def softest_mode(scene):
     """Return Newton's method in one mode."""
     vectors = scene.loads.eigenmodes.vectors[..., :1]
-    return SubspaceNewton(scene.problem, vectors / vectors.norm(), **options)
+    return SubspaceNewton(scene.problem, vectors / vectors.norm())
+
+
+def with_errors(sim, prediction, outside):
+    """Let a model state these relative errors of its prediction and outside of its modes."""
+    sim.surrogate.predict_with_errors = lambda load: (
+        sim.surrogate.predict(load),
+        torch.tensor([[prediction, outside]] * len(load.force), dtype=torch.float64),
+    )
+    return sim
 
 
 def errors_of(answer, scene, truth):
@@ -310,9 +319,7 @@ def test_a_summary_states_inversion_convergence_stability_and_range():
     assert "UNSTABLE (2 negative eigenvalues)" in summarise(column, True, 1e-9, 1.0, 0.0, False)
 
 
-def test_the_error_in_modes_counts_in_range_only_and_saves_the_correction(
-    scene, forces, monkeypatch
-):
+def test_known_errors_count_in_range_only_and_save_the_correction(scene, forces, monkeypatch):
     seen = []
 
     def counted(*arguments, **options):
@@ -320,21 +327,23 @@ def test_the_error_in_modes_counts_in_range_only_and_saves_the_correction(
         return estimate_error(*arguments, **options)
 
     monkeypatch.setattr(simulator_module, "estimate_error", counted)
-    sim = simulator_of(scene, 1.0, newton=softest_mode(scene, outside_error=1e-4))
-    inside = sim(forces[0])
-    assert inside.error == pytest.approx(1e-4, rel=1e-3)
+    newton = softest_mode(scene)
+    sim = with_errors(simulator_of(scene, 1.0, newton=newton), 5e-3, 1e-4)
+    assert sim(forces[0]).error == pytest.approx(1e-4, rel=1e-3), "that outside of the mode"
     assert not seen
+    assert sim(forces[0], error=5e-3).error == 5e-3, "that of the prediction"
+    assert len(seen) == 1, "of a random load, which judges the network"
     assert sim(forces[0], error=1e-5).error < 1e-6
-    assert len(seen) == 2, "one of a random load, which judges the network"
+    assert len(seen) == 2
     largest = scene.loads.eigenmodes.vectors @ (1.5 * scene.loads.q_max)
     outside = sim(torch.where(scene.loads.loadable_dofs, largest, 0.0) * scene.force_unit * E)
     assert outside.out_of_distribution
     assert outside.error < 1e-6
     assert len(seen) == 3
-    unknown = simulator_of(scene, 1.0, newton=softest_mode(scene))
+    unknown = simulator_of(scene, 1.0, newton=newton)
     assert unknown(forces[0]).error < 1e-6
     assert len(seen) == 4
-    noisy = simulator_of(scene, 1.0, newton=softest_mode(scene, outside_error=1e-4))
+    noisy = with_errors(simulator_of(scene, 1.0, newton=newton), 1e-4, 1e-4)
     noise = 6e-3 * torch.randn(scene.problem.shape, generator=torch.Generator().manual_seed(0))
     predict = noisy.surrogate.predict
     noisy.surrogate.predict = lambda load: predict(load) + noise * scene.problem.free

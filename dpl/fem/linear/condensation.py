@@ -100,6 +100,7 @@ def _inverse(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @njit(
     [
+        void(float32[::1], float32[:, ::1], float32[::1]),
         void(float64[::1], float32[:, ::1], float64[::1]),
         void(float64[::1], float64[:, ::1], float64[::1]),
     ],
@@ -124,8 +125,8 @@ def add_product(x, A, y):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=True)
 def dot(x, row):  # type: ignore[no-untyped-def]
-    """Return the product of a vector (F,) of float64 and a row (F,) of any type."""
-    total = 0.0
+    """Return the product of a vector (F,) and a row (F,), in the type of the vector."""
+    total = x.dtype.type(0)
     for j in range(len(x)):
         total += x[j] * row[j]
     return total
@@ -137,7 +138,7 @@ def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
     n = A.shape[1]
     i = 0
     while i + 4 <= len(y):
-        a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        a = b = c = d = x.dtype.type(0)
         for j in range(n):
             a += A[i, j] * x[j]
             b += A[i + 1, j] * x[j]
@@ -155,6 +156,7 @@ def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
 
 @njit(
     [
+        void(int64[:, ::1], int64[::1], float32[::1], float32[::1], float32[::1]),
         void(int64[:, ::1], int64[::1], float32[::1], float64[::1], float64[::1]),
         void(int64[:, ::1], int64[::1], float64[::1], float64[::1], float64[::1]),
     ],
@@ -166,20 +168,20 @@ def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[n
     Args:
         table, unknowns: See `Fronts`.
         values: Blocks of one matrix, (V,).
-        force: f, (n,), float64; overwritten.
-        solution: (n,), float64.
+        force: f, (n,), in float64 or in the type of the blocks; overwritten.
+        solution: (n,), in the type of the force.
     """
-    work = np.zeros(len(force))
+    work, dtype = np.zeros_like(force), force.dtype
     for s in range(len(table)):
         first, middle, last, place = table[s]
         pivots, boundary = unknowns[first:middle], unknowns[middle:last]
         count, others = len(pivots), len(boundary)
         square = count * count
-        own, is_loaded = np.empty(count), False
+        own, is_loaded = np.empty(count, dtype), False
         for i in range(count):
             own[i] = force[pivots[i]]
             is_loaded = is_loaded or own[i] != 0.0
-        inner, passed = np.zeros(count), work[:others]
+        inner, passed = np.zeros(count, dtype), work[:others]
         if is_loaded:
             passed[:] = 0.0
             add_product(own, values[place : place + square].reshape((count, count)), inner)
@@ -196,7 +198,7 @@ def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[n
         start, outer = place + count * count, work[:others]
         for j in range(others):
             outer[j] = solution[boundary[j]]
-        own = np.empty(count)
+        own = np.empty(count, dtype)
         for i in range(count):
             own[i] = solution[pivots[i]]
         X = values[start : start + count * others].reshape((count, others))
@@ -207,6 +209,7 @@ def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[n
 
 @njit(
     [
+        void(int64[:, ::1], int64[::1], float32[:, ::1], float32[:, ::1], float32[:, ::1]),
         void(int64[:, ::1], int64[::1], float32[:, ::1], float64[:, ::1], float64[:, ::1]),
         void(int64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1]),
     ],
@@ -219,8 +222,8 @@ def condensed_solves(table, unknowns, values, forces, solutions):  # type: ignor
     Args:
         table, unknowns: See `Fronts`.
         values: Blocks of the matrices, (P, V).
-        forces: The forces, float64; overwritten.
-        solutions: (P, n), float64.
+        forces: The forces, in float64 or in the type of the blocks; overwritten.
+        solutions: (P, n), in the type of the forces.
     """
     for p in range(len(values)):
         if (forces[p] != 0.0).any():

@@ -1,6 +1,9 @@
 """Least-squares fit of a force by a few fixed forces, by which families recognise their loads."""
 
+import math
+
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -14,37 +17,65 @@ def fit(
 ) -> tuple[Array, float]:
     """Return the coefficients (K,) and the relative residual of a least-squares fit.
 
-    If the shapes are linearly dependent, the coefficients with the smallest norm are returned, or
-    coefficients in [low, high] of the same fit if those are not. A zero force has the residual 0.
+    The fit is over the nodes on which a force acts. If the shapes are linearly dependent, the
+    coefficients with the smallest norm are returned, or coefficients in [low, high] of the same fit
+    if those are not. A zero force has the residual 0.
 
     Args:
-        shapes: Fixed forces, (n, K).
-        force: The force, (n,).
+        shapes: Fixed forces, (N, D, K).
+        force: The force, (N, D).
         low, high: Range of the coefficients of a load.
     """
     unit = float(np.abs(force).max(initial=0.0))
     if unit == 0:
-        return np.zeros(shapes.shape[1]), 0.0
-    there = force / unit
-    U, sizes, Vt = np.linalg.svd(shapes.T @ shapes)
-    inverse = np.where(sizes > LEAST_SQUARE * sizes[0], 1 / np.maximum(sizes, 1e-300), 0.0)
-    q, rest = np.zeros(len(sizes)), there
-    for _ in range(2):  # the second time removes the rounding error of the normal equations
-        q = q + Vt.T @ (inverse * (U.T @ (shapes.T @ rest)))
-        rest = there - shapes @ q
-    q, residual = unit * q, float(np.linalg.norm(rest) / np.linalg.norm(there))
+        return np.zeros(shapes.shape[-1]), 0.0
+    count = shapes.shape[-1]
+    q, right, gram = np.zeros(count), np.zeros(count), np.zeros((count, count))
+    whole = _normal_equations(shapes, force, unit, q, gram, right)
+    sizes, axes = np.linalg.eigh(gram)
+    inverse = np.where(sizes > LEAST_SQUARE * sizes[-1], 1 / np.maximum(sizes, 1e-300), 0.0)
+    q = axes @ (inverse * (right @ axes))
+    # the second time removes the rounding error of the normal equations
+    rest = _normal_equations(shapes, force, unit, q, gram[:0], right)
+    step = axes @ (inverse * (right @ axes))
+    q, residual = unit * (q + step), math.sqrt(max(rest - step @ right, 0.0) / whole)
     if inverse.all() or low <= q.min() <= q.max() <= high:
         return q, residual
     from scipy.optimize import lsq_linear  # its import is not needed for independent shapes
 
     largest = max(-low, high) or 1.0
-    root = np.sqrt(np.where(inverse > 0, sizes / max(sizes[0], 1e-300), 0.0))[:, None] * Vt
+    root = np.sqrt(np.where(inverse > 0, sizes / max(sizes[-1], 1e-300), 0.0))[:, None] * axes.T
     wanted, bounds = root @ q / largest, (low / largest - EDGE, high / largest + EDGE)
     if (np.abs(wanted) > 2 * np.abs(root).sum(axis=1)).any():  # no such coefficients reach it
         return q, residual
     bounded = lsq_linear(root, wanted, bounds, method="bvls", tol=EDGE**2).x
     is_same = np.linalg.norm(root @ bounded - wanted) <= EDGE * np.linalg.norm(wanted)
     return (np.clip(largest * bounded, low, high) if is_same else q), residual
+
+
+@njit(cache=True)
+def _normal_equations(shapes, force, unit, q, gram, right):  # type: ignore[no-untyped-def]
+    """Set S^T S, unless (0, K), and S^T r with r = f / unit - S q; return |r|^2."""
+    nodes, dim, count = shapes.shape
+    gram[:], right[:], square = 0.0, 0.0, 0.0
+    for node in range(nodes):
+        is_loaded = False
+        for i in range(dim):
+            is_loaded = is_loaded or force[node, i] != 0.0
+        if not is_loaded:
+            continue
+        for i in range(dim):
+            row = shapes[node, i]
+            rest = force[node, i] / unit
+            for k in range(count):
+                rest -= row[k] * q[k]
+            for k in range(count):
+                right[k] += row[k] * rest
+            for k in range(len(gram)):
+                for j in range(count):
+                    gram[k, j] += row[k] * row[j]
+            square += rest * rest
+    return square
 
 
 def amplitudes(sizes: Array, low: float, high: float, largest: float) -> Array:

@@ -159,15 +159,17 @@ class CombinedLoads(SizedLoads):
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return amplitudes and relative residuals of a least-squares fit, see `LoadFamily`."""
-        shapes, span = self._acting_shapes, self.coefficient_range
-        fits = [fit(shapes, own, *span) for own in self.own_force(force).flatten(1).numpy()]
+        # as of one node with N D components, so that entries without a force count, too
+        shapes, span = self._acting_shapes[None], self.coefficient_range
+        forces = self.own_force(force).flatten(1)[:, None].numpy()
+        fits = [fit(shapes, own, *span) for own in forces]
         largest = [self.amplitudes(self.sizes_of(c)).max() for c, _ in fits]
         return force.new_tensor(largest), force.new_tensor([rest for _, rest in fits])
 
     @cached_property
     def _acting_shapes(self) -> Array:
         """The f_k on free degrees of freedom, (N D, K)."""
-        return self.problem.acting(self.shapes).flatten(1).numpy().T
+        return np.ascontiguousarray(self.problem.acting(self.shapes).flatten(1).numpy().T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,8 +76,6 @@ class SubspaceNewton:
             with V in float32 resolve errors down to about 1e-7.
         max_iter: Largest number of steps.
         min_damping: Smallest damping factor [-].
-        outside_error: Largest relative error outside the subspace at known states [-]; no part of
-            the estimates of an iteration.
         min_detF_ratio: As of `Newton`: a step must leave this part of min det F [-].
 
     Raises:
@@ -92,7 +90,6 @@ class SubspaceNewton:
     error_tol: float = 2e-5
     max_iter: int = 4
     min_damping: float = 2.0**-4
-    outside_error: float = 0.0
     min_detF_ratio: float = 0.2
 
     @classmethod

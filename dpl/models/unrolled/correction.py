@@ -1,30 +1,64 @@
-"""Choice of the modes and cells of Newton's method that follows a fitted reduced model."""
+"""Newton's method that follows a fitted reduced model, and the errors of both on held-out loads."""
 
-from dataclasses import replace
+import math
 
 import torch
 from torch import Tensor
 
-from dpl.fem import LinearSolver, Load, Problem, SubspaceNewton, estimate_error
+from dpl.fem import Load, Problem, SubspaceNewton
 from dpl.scene import Sample
 
 RANKS = (60, 160)  # numbers of modes that are tried, and all modes
 CANDIDATES = 600  # cells to choose from
 STATES = 32  # equilibria at which cells are chosen
 TOLERANCE = 3e-2  # of the reduced forces of these cells [-]
-MAX_STEPS = 6  # also of the simulator, whose remaining error this is
+MAX_STEPS = 6  # also of the simulator
 LOADS = 50  # held-out loads by whose errors the number of modes is chosen
 SUFFICIENT = 2e-3  # largest relative error of these loads for which no more modes are tried [-]
 ERROR = 1e-5  # estimated relative error at which the steps end [-]
+RIDGE = 1.0  # of exponents, in squares of logarithms
+DEVIATIONS = 5.0  # standard deviations of a fitted error after which it is at least `LEAST`
+LEAST = 1 / 3  # smallest ratio of an estimated and a true error [-]
+
+
+def fit_errors(sizes: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the logarithm of a factor, (), and exponents, (K + 2,), of estimated errors.
+
+    The estimated error is the factor times the product of the powers of the sizes: a regression of
+    the logarithms of errors on those of sizes. Exponents are shrunk towards those of the root of
+    the last correction over the linear coordinates. The factor is such that an error `DEVIATIONS`
+    standard deviations above the regression is estimated at `LEAST` of it. The deviations are
+    leave-one-out residuals.
+
+    Source: Allen (1974), Technometrics 16 (leave-one-out residuals of a ridge regression).
+
+    Args:
+        sizes: Sizes of held-out predictions, (S, K + 2), see `Maps`.
+        errors: Their true relative errors, (S,) [-].
+    """
+    tiny = torch.finfo(torch.float64).tiny
+    logs, target = sizes.clamp(min=tiny).log(), errors.clamp(min=tiny).log()
+    prior = torch.zeros_like(logs[0])
+    prior[0], prior[-1] = -0.5, 0.5
+    X = logs - logs.mean(dim=0)
+    rest = target - target.mean() - X @ prior
+    inverse = torch.linalg.inv(X.T @ X + RIDGE * torch.eye(len(prior)).double())
+    change = inverse @ (X.T @ rest)
+    leverage = 1 / len(X) + ((X @ inverse) * X).sum(dim=1)
+    left_out = (rest - X @ change) / (1 - leverage).clamp(min=1e-3)
+    deviation, exponents = left_out.square().mean().sqrt(), prior + change
+    shift = (DEVIATIONS * deviation + math.log(LEAST)).clamp(min=0)
+    return target.mean() - logs.mean(dim=0) @ exponents + shift, exponents
 
 
 def choose_newton(
     problem: Problem, modes: Tensor, states: Tensor, held_out: Sample, guesses: Tensor
-) -> SubspaceNewton:
+) -> tuple[SubspaceNewton, Tensor]:
     """Return Newton's method in the number of modes that suits held-out loads best.
 
     The fewest modes are taken with which `MAX_STEPS` steps bring every load below `SUFFICIENT`;
-    else those with the smallest largest error. It counts as the error outside the subspace.
+    else those with the smallest largest error. The relative errors (S,) of the held-out loads
+    after these steps are returned, too.
 
     Args:
         problem: The body.
@@ -38,39 +72,18 @@ def choose_newton(
     some = states[:: max(1, len(states) // STATES)][:STATES]
     whole = modes.shape[2]
     ranks = [*(rank for rank in RANKS if rank < whole), whole]
-    best: SubspaceNewton | None = None
+    best: tuple[SubspaceNewton, Tensor] | None = None
     for rank in ranks:
         solver = SubspaceNewton.within(
             problem, modes[..., :rank], some, tolerance=TOLERANCE, candidates=candidates
         )
-        worst = float(_relative(held_out, _after(solver, held_out, guesses)).max())
-        if best is None or worst < best.outside_error:
-            best = replace(solver, outside_error=worst)
-        if worst < SUFFICIENT:
+        errors = relative_errors(held_out, _after(solver, held_out, guesses))
+        if best is None or errors.max() < best[1].max():
+            best = solver, errors
+        if errors.max() < SUFFICIENT:
             break
     assert best is not None
     return best
-
-
-def remaining_error(
-    solver: SubspaceNewton, linear: LinearSolver, loads: Load, guesses: Tensor
-) -> float:
-    """Return the largest relative error that the steps leave [-], as a correction estimates it.
-
-    The correction is that of K(0) in the rotated frames of the nodes. The error is infinite where
-    an element is inverted.
-
-    Args:
-        solver: Newton's method in the modes.
-        linear: Linear solver of the body.
-        loads: The loads, (S, N, D).
-        guesses: Their predictions, (S, N, D).
-    """
-    pairs = zip(loads.unbatch(), guesses, strict=True)
-    return max(
-        estimate_error(linear, load, _last(solver, load, guess)[None], products=0).error
-        for load, guess in pairs
-    )
 
 
 def _after(solver: SubspaceNewton, samples: Sample, guesses: Tensor) -> Tensor:
@@ -85,7 +98,7 @@ def _last(solver: SubspaceNewton, load: Load, guess: Tensor) -> Tensor:
     return last.displacement[0]
 
 
-def _relative(samples: Sample, displacement: Tensor) -> Tensor:
+def relative_errors(samples: Sample, displacement: Tensor) -> Tensor:
     """Return relative errors, (S,); 0 where the displacement is zero."""
     size = samples.displacement.flatten(1).norm(dim=1)
     error = (displacement - samples.displacement).flatten(1).norm(dim=1)

@@ -44,8 +44,10 @@ class Maps(NamedTuple):
     others: Sequence[Tensor]
     limits: Tensor
 
-    def __call__(self, law: Material, linear: Tensor) -> Tensor:
-        """Return coordinates (B, R) of nonlinear displacements.
+    def __call__(self, law: Material, linear: Tensor) -> tuple[Tensor, Tensor]:
+        """Return coordinates (B, R) of nonlinear displacements, and sizes (B, K + 2).
+
+        The sizes are the norms of the linear coordinates and of the correction by each map.
 
         Args:
             law: The law, see `Material.with_parameters`.
@@ -54,11 +56,13 @@ class Maps(NamedTuple):
         H = self.cells.gradient(linear)
         step = self.cells.first_features(H).flatten(1) @ self.first
         c = step = limit_step(step, linear, self.limits[0])
+        steps = [linear, step]
         for matrix, limit in zip(self.others, self.limits[1:], strict=True):
             proposed = self.cells.features(law, linear + c, H).flatten(1) @ matrix
             step = limit_step(proposed, step, limit)
             c = c + step
-        return c
+            steps.append(step)
+        return c, torch.stack(steps, dim=1).norm(dim=2)
 
 
 def limit_step(step: Tensor, before: Tensor, limit: Tensor) -> Tensor:
@@ -321,19 +325,6 @@ def fit_maps(
     return best
 
 
-class FittedBuffers(NamedTuple):
-    """Buffers of `dpl.models.Unrolled` for the modes that were chosen; see there."""
-
-    modes: Tensor
-    parity: Tensor
-    stiffness: Tensor
-    cells: Tensor
-    gradients: Tensor
-    first_map: Tensor
-    maps: Tensor
-    limits: Tensor
-
-
 def fit_in_best_modes(
     problem: Problem,
     group: SymmetryGroup,
@@ -343,7 +334,7 @@ def fit_in_best_modes(
     rank: int,
     cells: int,
     stages: int,
-) -> tuple[FittedBuffers, Tensor]:
+) -> tuple[dict[str, Tensor], Tensor]:
     """Fit the maps in all modes, in half and in a quarter of them.
 
     Args:
@@ -356,7 +347,8 @@ def fit_in_best_modes(
         stages: Largest number of maps after the first.
 
     Returns:
-        The fit with the smallest weighted mean error of held-out samples, and all modes, (n, R).
+        The buffers of `dpl.models.Unrolled`, by name, of the fit with the smallest weighted mean
+        error of held-out samples; and all modes, (n, R).
     """
     rests = [nonlinear_displacement(problem, part, linear) for part in both]
     weights = sample_weights(both[0].displacement[:, problem.free])
@@ -364,7 +356,7 @@ def fit_in_best_modes(
     inverses = [symmetry.inverse for symmetry in group.coset_representatives()]
     few = inverses[: max(1, MAX_ROWS // len(rests[0]))]
     turned = [_image(every.T, one, problem.free).T for one in few]
-    fits: list[tuple[float, FittedBuffers]] = []
+    fits: list[tuple[float, dict[str, Tensor]]] = []
     count = every.shape[1]
     while count:
         modes = every[:, :count]
@@ -387,11 +379,16 @@ def fit_in_best_modes(
 
 def _buffers(
     modes: Tensor, parity: Tensor, stiffness: ReducedStiffness, cells: Tensor, maps: Maps
-) -> FittedBuffers:
+) -> dict[str, Tensor]:
     first = maps.first.float()
     none = torch.zeros(0, 2 * len(first), modes.shape[1])
-    others = torch.stack([one.float() for one in maps.others]) if maps.others else none
-    gradients, limits = maps.cells.gradients, maps.limits
-    return FittedBuffers(
-        modes.float(), parity, stiffness.parts, cells, gradients, first, others, limits
-    )
+    return {
+        "modes": modes.float(),
+        "parity": parity,
+        "stiffness": stiffness.parts,
+        "cells": cells,
+        "gradients": maps.cells.gradients,
+        "first_map": first,
+        "maps": torch.stack([one.float() for one in maps.others]) if maps.others else none,
+        "limits": maps.limits,
+    }

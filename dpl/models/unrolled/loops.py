@@ -17,7 +17,8 @@ from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.lanes import gather_constants, rows
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.linear import condensation
-from dpl.fem.linear.condensation import add_product, dot
+from dpl.fem.linear.condensation import add_product, subtract_product
+from dpl.models.linear_response import OrbitArrays
 from dpl.models.unrolled import feature_loops
 from dpl.models.unrolled.feature_loops import rotated_strain, unbalanced_stress
 
@@ -36,20 +37,6 @@ def limit_step(step, most):
         step *= most / size
         return most
     return size
-
-
-class OrbitArrays(NamedTuple):
-    """Degrees of freedom by parity p and symmetry g, see `dpl.fem.parity`.
-
-    Attributes:
-        characters: Factor of parity p under symmetry g, (M, M).
-        dofs: Images of one degree of freedom of each of m orbits, (M, m).
-        signs: Factors of these images, (M, m).
-    """
-
-    characters: NDArray[np.float64]
-    dofs: NDArray[np.int64]
-    signs: NDArray[np.float64]
 
 
 class BasisArrays(NamedTuple):
@@ -76,8 +63,8 @@ class MapArrays(NamedTuple):
         entry_signs: Factors of the images of entries of G, (M, b).
         first_signs: The same times weights of the orbits, (M, b).
         map_signs: The same for two tensors, (M, 2 b).
-        first: B_0, (M, b, r).
-        others: B_1, ..., (K, M, 2 b, r).
+        first: B_0^T, (M, r, b).
+        others: B_1^T, ..., (K, M, r, 2 b).
         limits: Largest ratio of each correction to the one before, (1 + K,).
     """
 
@@ -98,7 +85,6 @@ class ModelArrays(NamedTuple):
         orbits: Degrees of freedom.
         basis: Modes of the nonlinear displacement.
         maps: Maps of the iterations.
-        linear: The linear solution.
     """
 
     orbits: OrbitArrays
@@ -147,56 +133,64 @@ def set_gradients(model, coordinates, own, parts, H):
 
 @njit
 def set_step(model, signs, matrices, features, parts, own, step):
-    """Set step (R,) to the product of features (M, b) with matrices (M, b, r)."""
+    """Set step (R,) to the product of features (M, b) with matrices (M, r, b)."""
     split(model.orbits.characters, signs, features, parts)
     for p in range(len(parts)):
         own[:] = 0.0
-        add_product(parts[p], matrices[p], own)
+        subtract_product(matrices[p], parts[p], own)
         for k in range(len(own)):
             if model.basis.columns[p, k] < len(step):
-                step[model.basis.columns[p, k]] = own[k]
+                step[model.basis.columns[p, k]] = -own[k]
 
 
 @njit
-def galerkin(basis, inverse, supports, parts):
+def galerkin(basis, inverse, parts):
     """Return the coordinates (R,) of the Galerkin linear solution of a force by parity (M, m)."""
-    right = -supports
+    right = np.zeros(len(inverse))
     for p in range(len(parts)):
-        for k in range(basis.columns.shape[1]):
+        own = np.zeros(basis.columns.shape[1], parts.dtype)
+        subtract_product(basis.modes[p], parts[p], own)
+        for k in range(len(own)):
             if basis.columns[p, k] < len(right):
-                right[basis.columns[p, k]] += dot(parts[p], basis.modes[p, k])
-    return inverse @ right
+                right[basis.columns[p, k]] = -own[k]
+    found = np.zeros(len(inverse))
+    add_product(right, inverse, found)  # no BLAS, whose threads wait for each other
+    return found
 
 
 @njit
 def add_modes(basis, coordinates, values):
     """Add V c to values by parity (M, m)."""
-    own = np.zeros(basis.columns.shape[1])
+    own = np.zeros(basis.columns.shape[1], values.dtype)
     for p in range(len(values)):
         of_parity(basis.columns[p], coordinates, own)
         add_product(own, basis.modes[p], values[p])
 
 
-@njit
-def set_field(orbits, values, field):
-    """Set a field (N D,) at free degrees of freedom from values by parity (M, m)."""
+@njit(fastmath=True)
+def set_field(orbits, values, unit, field):
+    """Set a field (N D,) at free degrees of freedom from values over a unit by parity (M, m)."""
     M, m = orbits.dofs.shape
+    own = np.empty(m)
     for g in range(M):
+        own[:] = 0.0
+        for p in range(M):
+            factor = unit * orbits.characters[p, g]
+            for j in range(m):
+                own[j] += factor * values[p, j]
         for j in range(m):
-            value = 0.0
-            for p in range(M):
-                value += orbits.characters[p, g] * values[p, j]
-            field[orbits.dofs[g, j]] = orbits.signs[g, j] * value
+            field[orbits.dofs[g, j]] = orbits.signs[g, j] * own[j]
 
 
 @njit(error_model="numpy")
-def nonlinear_coordinates(law, c, needs, finite, model, linear):
+def nonlinear_coordinates(law, c, needs, finite, model, linear, sizes):
     """Return coordinates (R,) of the nonlinear displacement.
 
     Args:
         law, c, needs, finite: The law, see `dpl.models.unrolled.compiled.law_arguments`.
         model: The arrays of the model.
         linear: Coordinates of the Galerkin linear solution, (R,).
+        sizes: Norms of these coordinates and of the corrections by the maps, (K + 2,); set.
     """
     M, b = model.maps.rest.shape
     shape = M * b // (9 * SIMD_WIDTH), 9, SIMD_WIDTH
@@ -212,7 +206,8 @@ def nonlinear_coordinates(law, c, needs, finite, model, linear):
         rotated_strain(linear_blocks[k], features[k])
     maps, step = model.maps, np.zeros(len(linear))
     set_step(model, maps.first_signs, maps.first, features.reshape((M, b)), parts, own, step)
-    size = limit_step(step, maps.limits[0] * np.sqrt((linear * linear).sum()))
+    sizes[0] = np.sqrt((linear * linear).sum())
+    sizes[1] = limit_step(step, maps.limits[0] * sizes[0])
     total = step.copy()
     for i in range(len(maps.others)):
         set_gradients(model, linear + total, own, parts, H)
@@ -222,24 +217,25 @@ def nonlinear_coordinates(law, c, needs, finite, model, linear):
                 law, constants, needs, finite, present[k], linear_blocks[k], work, blocks[k]
             )
         set_step(model, maps.map_signs, maps.others[i], stress, both, own, step)
-        size = limit_step(step, maps.limits[i + 1] * size)
+        sizes[i + 2] = limit_step(step, maps.limits[i + 1] * sizes[i + 1])
         total += step
     return total
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def predict(law, c, needs, finite, model, reduced, parts, solution, field):
+def predict(law, c, needs, finite, model, inverse, unit, parts, solution, field, sizes):
     """Set the field of a prediction.
 
     Args:
         law, c, needs, finite: The law, see `dpl.models.unrolled.compiled.law_arguments`.
         model: The arrays of the model.
-        reduced: (V^T K(0) V)^-1, (R, R), and V^T K(0) p of the prescribed displacement p, (R,).
-        parts: The force by parity, (M, m).
-        solution: Its linear solution by parity, (M, m); overwritten.
+        inverse: (V^T K(0) V)^-1, (R, R).
+        unit, parts, solution: Force and linear solution by parity, see `LinearResponse.at`; the
+            solution is overwritten.
         field: Displacement at free degrees of freedom, (N D,).
+        sizes: Norms of the corrections, see `nonlinear_coordinates`.
     """
-    linear = galerkin(model.basis, reduced[0], reduced[1], parts)
-    found = nonlinear_coordinates(law, c, needs, finite, model, linear)
-    add_modes(model.basis, found, solution)
-    set_field(model.orbits, solution, field)
+    linear = unit * galerkin(model.basis, inverse, parts)
+    found = nonlinear_coordinates(law, c, needs, finite, model, linear, sizes)
+    add_modes(model.basis, found / unit, solution)
+    set_field(model.orbits, solution, unit, field)

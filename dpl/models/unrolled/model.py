@@ -1,36 +1,39 @@
 """Unrolled reduced solver: a few iterations in a subspace whose linear maps are fitted to data."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from functools import cached_property
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from dpl.fem import InvariantBasedMaterial, Material, SubspaceNewton, symmetries
+from dpl.fem import InvariantBasedMaterial, SubspaceNewton, estimate_error, symmetries
+from dpl.fem.assembly.kernels import call_compiled
 from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.parity import Parities
 from dpl.fem.rom.ecsw import Cubature, refuse_follower_loads
 from dpl.fem.rom.pod import orthonormal_fields
-from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
+from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.symmetry import SymmetryGroup
 from dpl.models.linear_base import SCALE_STREAM
-from dpl.models.linear_response import Array, LinearResponse
+from dpl.models.linear_response import Array, LinearResponse, Parts
 from dpl.models.stored_buffers import StoredBuffers, check_indices
-from dpl.models.unrolled.compiled import CompiledPrediction, LawArguments, law_arguments
-from dpl.models.unrolled.correction import LOADS, choose_newton, remaining_error
+from dpl.models.unrolled.compiled import LawArguments, law_arguments, model_arrays
+from dpl.models.unrolled.correction import LOADS, choose_newton, fit_errors, relative_errors
 from dpl.models.unrolled.features import SampleCells
 from dpl.models.unrolled.fit import Maps, fit_in_best_modes
+from dpl.models.unrolled.loops import ModelArrays, predict
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.threads import on_threads
 
-FEW = 8  # loads at which the error outside the modes is measured
+FEW = 8  # loads by which stored errors are compared with measured ones
 LARGER = 3.0  # ratio of a measured to a stored error up to which both are plausible
+SMALL = 0.1  # part of held-out samples whose sizes are too small for a fit of their errors
 MAX_SIZE = 100_000  # of rank, cells and stages
 # buffers and axes with the numbers of modes, cells, maps, and modes and cells of Newton's method
 SIZES = (("modes", 1), ("cells", 0), ("maps", 0), ("newton_modes", 1), ("newton_cells", 0))
-_AtLaw = tuple[LawArguments, ReducedInverse, Callable[[Array], Array]]
+_Solve = Callable[[Array], tuple[float, Parts, Parts]]  # see `LinearResponse.at`
 
 
 class Unrolled(StoredBuffers):
@@ -82,8 +85,11 @@ class Unrolled(StoredBuffers):
         newton_modes: Modes of Newton's method that follows, (n, K).
         newton_cells: Cells of its tangent, (C,).
         newton_weights: Their weights, (C,).
-        outside_error: Largest relative error that it left at held-out samples, (). `correction`
-            takes the error that it measures at a few loads if that is `LARGER` times as large.
+        error_factors, error_exponents: Estimated errors of the prediction, and of what Newton's
+            method leaves, by the sizes of the corrections, (2,) and (2, K + 2), see `fit_errors`;
+            the factors are logarithms.
+        least_sizes: Sizes that a tenth of the held-out samples do not reach, (K + 2,). Smaller ones
+            count as these.
         fitted: True after `fit`, ().
     """
 
@@ -98,7 +104,9 @@ class Unrolled(StoredBuffers):
     newton_modes: Tensor
     newton_cells: Tensor
     newton_weights: Tensor
-    outside_error: Tensor
+    error_factors: Tensor
+    error_exponents: Tensor
+    least_sizes: Tensor
     fitted: Tensor
     dofs: Tensor
     prescribed: Tensor
@@ -136,9 +144,9 @@ class Unrolled(StoredBuffers):
         for name, (shape, dtype) in self._layout().items():
             self.register_buffer(name, torch.zeros(shape, dtype=dtype))
         self._stiffness = ReducedStiffness(self.stiffness, self.linear.iteration)
-        self._compiled: tuple[Tensor, CompiledPrediction] | None = None
+        self._compiled: tuple[Tensor, ModelArrays, Tensor] | None = None
         self._law_of_samples = scene.problem.material  # perhaps with ranges
-        self._at_last_law: tuple[tuple[Tensor, Any], _AtLaw] | None = None
+        self._last: tuple[Tensor, Tensor, tuple[LawArguments, Array, _Solve]] | None = None
         dofs = scene.problem.free.flatten().nonzero()[:, 0]
         self.register_buffer("dofs", dofs, persistent=False)
         self.register_buffer("prescribed", scene.problem.prescribed, persistent=False)
@@ -161,7 +169,9 @@ class Unrolled(StoredBuffers):
             "newton_modes": ((free, newton_modes), torch.float32),
             "newton_cells": ((newton,), torch.int64),
             "newton_weights": ((newton,), torch.float64),
-            "outside_error": ((), torch.float64),
+            "error_factors": ((2,), torch.float64),
+            "error_exponents": ((2, 2 + maps), torch.float64),
+            "least_sizes": ((2 + maps,), torch.float64),
             "fitted": ((), torch.bool),
         }
 
@@ -174,15 +184,47 @@ class Unrolled(StoredBuffers):
             force: Nodal forces.
             parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
         """
+        return self._fields(force, parameters)[0]
+
+    def forward_with_errors(
+        self, force: Tensor, parameters: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return displacements and their estimated errors, see `HasCorrection`."""
+        fields, sizes = self._fields(force, parameters)
+        return fields, self._doubt * self._stored_errors(sizes)
+
+    def _stored_errors(self, sizes: Tensor) -> Tensor:
+        """Return the estimated relative errors (B, 2) of sizes (B, K + 2)."""
+        logs = torch.maximum(sizes, self.least_sizes).log()
+        return torch.addmm(self.error_factors, logs, self.error_exponents.T).exp()
+
+    @cached_property
+    def _doubt(self) -> float:
+        """Factor on stored errors that are far below a measured one of a few random loads.
+
+        They are if a file is damaged. The measured error is the correction of K(0) in the rotated
+        frames of the nodes.
+        """
+        scene, load = self.scene, self.scene.loads.sample((0, SCALE_STREAM), range(FEW))
+        own = (load.parameters,) if self.extra_inputs else ()
+        fields, sizes = self._fields(load.force, *own)
+        pairs = zip(load.unbatch(), fields.split(1), strict=True)
+        measured = [estimate_error(scene.linear, *pair, products=0).error for pair in pairs]
+        ratio = float((torch.tensor(measured) / self._stored_errors(sizes)[:, 0]).max())
+        return 1.0 if ratio <= LARGER else ratio
+
+    def _fields(self, force: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return displacements and the sizes of their corrections, (B, K + 2), see `Maps`."""
         given = self._given_parameters(force, parameters)
         if self._is_compiled(force, given):
             return self._compiled_fields(force, given)
         loaded = force.flatten(1)[:, self.dofs]
         linear = self.linear(loaded, given)
-        return self._field(linear + self._at_free_dofs(self.coordinates(loaded, given)))
+        coordinates, sizes = self.coordinates(loaded, given)
+        return self._field(linear + self._at_free_dofs(coordinates)), sizes
 
-    def coordinates(self, loaded: Tensor, parameters: Tensor) -> Tensor:
-        """Return coordinates (B, R) of the nonlinear displacement.
+    def coordinates(self, loaded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """Return coordinates (B, R) of the nonlinear displacement, and sizes, see `Maps`.
 
         Args:
             loaded: Forces at free degrees of freedom, (B, n).
@@ -201,6 +243,7 @@ class Unrolled(StoredBuffers):
         parts = self.stiffness.detach().cpu().clone()
         self._stiffness = ReducedStiffness(parts, self.linear.iteration)
         self._law_of_samples = self.scene.problem.material.of_cells(self.cells.cpu()).centred()
+        self.__dict__.pop("_doubt", None)
 
     def _at_free_dofs(self, coordinates: Tensor) -> Tensor:
         """Return V c at free degrees of freedom, (B, n), of c (B, R)."""
@@ -214,50 +257,50 @@ class Unrolled(StoredBuffers):
         differentiable = torch.is_grad_enabled() and (
             force.requires_grad or parameters.requires_grad
         )
-        law = one_law(self.scene.problem.reference.material)
-        return self.is_fitted and not differentiable and isinstance(law, InvariantBasedMaterial)
+        return self.is_fitted and not differentiable and self._has_loops
 
-    def _compiled_fields(self, force: Tensor, parameters: Tensor) -> Tensor:
-        """Return displacements (B, N, D) of forces (B, N, D), on the threads of torch."""
-        fields = self.prescribed.repeat(force.shape[0], 1, 1)
-        material, predict = self.scene.problem.material, self._prediction
+    @cached_property
+    def _has_loops(self) -> bool:
+        """True if there are compiled loops of the law."""
+        return isinstance(one_law(self.scene.problem.reference.material), InvariantBasedMaterial)
+
+    def _compiled_fields(self, force: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the same as `_fields` by compiled loops, on the threads of torch."""
+        fields = torch.empty_like(force).copy_(self.prescribed)
+        sizes = fields.new_zeros(force.shape[0], 2 + len(self.maps))
+        arrays, _ = self._arrays
         forces, parameters = force.detach(), parameters.detach()
 
         def predict_one(k: int) -> None:
-            law = material.with_parameters(parameters[k : k + 1])
-            arguments, reduced, solve = self._at_law(law)
-            parts = self.linear.parts(forces[k].numpy())
-            predict(arguments, reduced, parts, solve(parts), fields[k].numpy())
+            law, inverse, solve = self._at(parameters[k : k + 1])
+            linear = solve(forces[k].numpy())
+            out = fields[k].view(-1).numpy(), sizes[k].numpy()
+            call_compiled(predict, *law, arrays, inverse, *linear, *out)
 
         on_threads(predict_one, range(len(forces)))
-        return fields
+        return fields, sizes
 
     @property
-    def _prediction(self) -> CompiledPrediction:
-        """Compiled prediction with the present buffers."""
+    def _arrays(self) -> tuple[ModelArrays, Tensor]:
+        """Arrays of the compiled prediction with the present buffers, see `model_arrays`."""
         if self._compiled is None or self._compiled[0] is not self.maps:
-            problem = self.scene.problem
-            images = self.group.cell_images(problem)[:, self.cells]
-            names = ("parity", "modes", "gradients", "first_map", "maps", "limits")
-            prediction = CompiledPrediction.of(
-                self.group,
-                problem.free,
-                positions=torch.searchsorted(self.cells, images),
-                **{name: getattr(self, name) for name in names},
-            )
-            self._compiled = self.maps, prediction
-        return self._compiled[1]
+            images = self.group.cell_images(self.scene.problem)[:, self.cells]
+            buffers = {name: getattr(self, name) for name in self._layout()}
+            arrays = model_arrays(self.linear, torch.searchsorted(self.cells, images), buffers)
+            self._compiled = self.maps, *arrays
+        return self._compiled[1:]
 
-    def _at_law(self, law: Material) -> _AtLaw:
-        """Return the law, the reduced body and the linear solution, kept for one law."""
-        last = self._at_last_law  # read once: another thread may replace it
-        if last is not None and last[0][0] is self.stiffness and last[0][1] == law:
-            return last[1]
-        of_cells = one_law(law.of_cells(self.cells[self._prediction.cells]).centred())
-        reduced = self._stiffness.inverse(self.linear.terms.factors(law))
-        isotropic = cast("InvariantBasedMaterial", of_cells)
-        found = law_arguments(isotropic), reduced, self.linear.at(law)
-        self._at_last_law = (self.stiffness, law), found
+    def _at(self, parameters: Tensor) -> tuple[LawArguments, Array, _Solve]:
+        """Return law, reduced inverse and linear solution of parameters (1, P), the last kept."""
+        last = self._last  # read once: another thread may replace it
+        if last and last[0] is self.stiffness and torch.equal(last[1], parameters):
+            return last[2]
+        law = self.scene.problem.material.with_parameters(parameters)
+        of_cells = one_law(law.of_cells(self.cells[self._arrays[1]]).centred())
+        inverse, _ = self._stiffness.inverse(self.linear.terms.factors(law))
+        arguments = law_arguments(cast("InvariantBasedMaterial", of_cells))
+        found = arguments, inverse, self.linear.at(law)
+        self._last = self.stiffness, parameters.clone(), found
         return found
 
     def _given_parameters(self, force: Tensor, parameters: Tensor | None) -> Tensor:
@@ -295,40 +338,40 @@ class Unrolled(StoredBuffers):
         best, every = fit_in_best_modes(
             problem, self.group, self.linear, (samples, held_out), **options
         )
-        for name, buffer in best._asdict().items():
+        for name, buffer in best.items():
             setattr(self, name, buffer)
         self._prepare()
         self.fitted = torch.tensor(True)
         self._fit_newton(every, samples, held_out)
 
     def _fit_newton(self, every: Tensor, samples: Sample, held_out: Sample) -> None:
-        """Choose modes and cells of Newton's method that follows the maps.
+        """Choose modes and cells of Newton's method, and fit the errors to held-out samples.
 
         Args:
             every: Modes to choose from, the most important one first, (n, R).
             samples, held_out: See `fit`.
         """
+        own = (held_out.parameters,) if self.extra_inputs else ()
+        guesses, sizes = self._fields(held_out.force, *own)
         few = Sample(*(column[:LOADS] for column in held_out))
-        guesses = self(few.force, *((few.parameters,) if self.extra_inputs else ()))
         problem, states = self.scene.problem, samples.displacement
         vectors = orthonormal_fields(every, problem.free)
-        found = choose_newton(problem, vectors, states, few, guesses)
+        found, left = choose_newton(problem, vectors, states, few, guesses[:LOADS])
         self.newton_modes = every[:, : found.vectors.shape[2]].float()
         assert found.cubature is not None  # cells are always chosen
         self.newton_cells, self.newton_weights = found.cubature.cells, found.cubature.weights
-        self.outside_error = torch.tensor(found.outside_error, dtype=torch.float64)
+        both = (sizes, relative_errors(held_out, guesses)), (sizes[: len(left)], left)
+        columns = zip(*(fit_errors(*pair) for pair in both), strict=True)
+        self.error_factors, self.error_exponents = map(torch.stack, columns)
+        self.least_sizes = sizes.quantile(SMALL, dim=0).clamp(min=1e-300)
 
     def correction(self) -> SubspaceNewton | None:
         if not self.newton_modes.shape[1]:
             return None
-        problem, load = self.scene.problem, self.scene.loads.sample((0, SCALE_STREAM), range(FEW))
-        vectors = orthonormal_fields(self.newton_modes, problem.free)
+        self._doubt  # noqa: B018  # computed here, so that the first prediction is not slower
+        vectors = orthonormal_fields(self.newton_modes, self.scene.problem.free)
         cells = Cubature(self.newton_cells, self.newton_weights, 0.0)
-        solver = SubspaceNewton(problem, vectors, cells)
-        guesses = self(load.force, *((load.parameters,) if self.extra_inputs else ()))
-        measured = remaining_error(solver, self.scene.linear, load, guesses)
-        stored = float(self.outside_error)  # of more loads, by their solutions
-        return replace(solver, outside_error=stored if measured <= LARGER * stored else measured)
+        return SubspaceNewton(self.scene.problem, vectors, cells)
 
     def skipped_work(self) -> list[str]:
         """Return the work that the model saves, one line each."""
@@ -362,7 +405,7 @@ class Unrolled(StoredBuffers):
         images = self.group.cell_images(problem)[:, cells.cpu()]
         if (cells.diff() <= 0).any() or not torch.isin(images, cells.cpu()).all():
             raise ValueError("cells must ascend and have all images under the symmetries")
-        for name in ("limits", "newton_weights", "outside_error"):
+        for name in ("limits", "newton_weights", "least_sizes"):
             if (getattr(self, name) < 0).any():
                 raise ValueError(f"{name} must be 0 or more")
         factors = self.linear.terms.factors(problem.reference.material)
