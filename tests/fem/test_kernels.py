@@ -121,7 +121,7 @@ PARALLELEPIPEDS = {
     "equal": lambda p: SHEAR @ p,
     "graded": lambda p: SHEAR @ (p + 0.3 * p**2),
 }
-HEXAHEDRA = PARALLELEPIPEDS | {"general": lambda p: p + 0.1 * np.sin(5 * p[[1, 2, 0]])}
+HEXAHEDRA = PARALLELEPIPEDS | {"general": lambda p: p + 0.3 * p[[1, 2, 0]] * p[[2, 0, 1]]}
 
 
 @pytest.mark.parametrize("order", [lambda mesh: mesh, turned], ids=["grid", "turned"])

@@ -95,17 +95,24 @@ def extrapolate(D, gap, S):
 
 
 @inlined
-def invert(e, X):
-    """Set X to C^-1, where C = I + e."""
+def invert(e, X, Y):
+    """Set X to C^-1 and Y to I - C^-1, where C = I + e; Y keeps the digits of small strains."""
     e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
     e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
-    inverse = 1.0 / (1.0 + square(e))
-    store(X, 0, (1.0 + e1 + e2 + (e1 * e2 - e4 * e4)) * inverse)
-    store(X, 1, (1.0 + e0 + e2 + (e0 * e2 - e5 * e5)) * inverse)
-    store(X, 2, (1.0 + e0 + e1 + (e0 * e1 - e3 * e3)) * inverse)
-    store(X, 3, (e4 * e5 - e3 - e3 * e2) * inverse)
-    store(X, 4, (e3 * e5 - e4 - e0 * e4) * inverse)
-    store(X, 5, (e3 * e4 - e5 - e1 * e5) * inverse)
+    m0, m1, m2 = e1 * e2 - e4 * e4, e0 * e2 - e5 * e5, e0 * e1 - e3 * e3
+    third = e0 * m0 - e3 * (e3 * e2 - e4 * e5) + e5 * (e3 * e4 - e1 * e5)
+    inverse = 1.0 / (1.0 + (e0 + e1 + e2 + (m0 + m1 + m2 + third)))
+    store(X, 0, (1.0 + (e1 + e2 + m0)) * inverse)
+    store(X, 1, (1.0 + (e0 + e2 + m1)) * inverse)
+    store(X, 2, (1.0 + (e0 + e1 + m2)) * inverse)
+    store(Y, 0, (e0 + (m1 + m2 + third)) * inverse)
+    store(Y, 1, (e1 + (m0 + m2 + third)) * inverse)
+    store(Y, 2, (e2 + (m0 + m1 + third)) * inverse)
+    store(Y, 3, (e3 + e3 * e2 - e4 * e5) * inverse)
+    store(Y, 4, (e4 + e0 * e4 - e3 * e5) * inverse)
+    store(Y, 5, (e5 + e1 * e5 - e3 * e4) * inverse)
+    for v in range(3, 6):
+        store(X, v, -load(Y, v))
 
 
 @inlined
@@ -119,8 +126,9 @@ def stress(law, c, needs, e, j, X, S, D, moduli):
     e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
     i1 = e0 + e1 + e2
     i2 = 2.0 * i1 + (e1 * e2 - e4 * e4 + (e0 * e2 - e5 * e5) + (e0 * e1 - e3 * e3))
+    Y = registers(6)
     if needs > 0:
-        invert(e, X)
+        invert(e, X, Y)
     log_j, m1 = j, j
     if needs > 1:
         log_j = log1p(j)
@@ -133,12 +141,8 @@ def stress(law, c, needs, e, j, X, S, D, moduli):
         stress = -2.0 * W2 * load(e, v)
         if v < 3:
             stress = stress + pressure
-        if needs > 0:  # - p e X
-            k = SECOND[v]
-            product = 0.0 * i1
-            for n in range(3):
-                product = product + load(e, VOIGT[FIRST[v], n]) * load(X, VOIGT[n, k])
-            stress = stress - p * product
+        if needs > 0:
+            stress = stress - p * load(Y, v)
         store(S, v, stress)
     if moduli:
         differentiate(derivatives, i1, e, X, D)
@@ -297,22 +301,36 @@ def differentiate(derivatives, i1, e, X, D):
 
 
 @inlined
-def nominal_stress(F, S, weight, P, at):
-    """Set the 9 rows of P from `at` to the first Piola-Kirchhoff stress F S times `weight`."""
+def along(P, directions, first, out, at):
+    """Set the rows 3 i + d of `out` from `at` to the sum over j of P_ij n_dj.
+
+    The directions n_dj are the rows 3 d + j of `directions` from `first`.
+    """
     for i in range(3):
-        for j in range(3):
-            stress = load(F, 3 * i) * load(S, VOIGT[0, j])
-            stress = stress + load(F, 3 * i + 1) * load(S, VOIGT[1, j])
-            stress = stress + load(F, 3 * i + 2) * load(S, VOIGT[2, j])
-            store(P, at + 3 * i + j, weight * stress)
+        p0, p1, p2 = load(P, 3 * i), load(P, 3 * i + 1), load(P, 3 * i + 2)
+        for d in range(3):
+            n = first + 3 * d
+            n0, n1, n2 = load(directions, n), load(directions, n + 1), load(directions, n + 2)
+            store(out, at + 3 * i + d, p0 * n0 + p1 * n1 + p2 * n2)
 
 
 @inlined
-def nominal_moduli(F, directions, first, D, S, weight, finite, A, at):
-    """Set the rows of A from `at`, see `PAIR`, to dP/dF times `weight` between directions.
+def nominal_stress(F, S, weight, P):
+    """Set P (rows 3 i + j) to the first Piola-Kirchhoff stress F S times `weight`."""
+    for j in range(3):
+        s0, s1 = weight * load(S, VOIGT[0, j]), weight * load(S, VOIGT[1, j])
+        s2 = weight * load(S, VOIGT[2, j])
+        for i in range(3):
+            stress = load(F, 3 * i) * s0 + load(F, 3 * i + 1) * s1 + load(F, 3 * i + 2) * s2
+            store(P, 3 * i + j, stress)
 
-    Row PAIR[3 i + d, 3 k + e] belongs to changes of F in component i along the direction d and in
-    component k along e. The directions are the rows 3 d + j of `directions` from `first`.
+
+@inlined
+def nominal_moduli(F, directions, first, D, S, weight, finite, A, q, Q):
+    """Set the rows Q pair + q of A to dP/dF times `weight` between directions, see `along`.
+
+    The pair PAIR[3 i + d, 3 k + e] belongs to changes of F in component i along the direction d and
+    in component k along e.
     """
     B, T = registers(54), registers(6)  # B: the changes of E, shear doubled, rows 6 (3 i + d) + v
     for i in range(3):
@@ -326,7 +344,7 @@ def nominal_moduli(F, directions, first, D, S, weight, finite, A, at):
             store(B, r + 3, f0 * n1 + f1 * n0)
             store(B, r + 4, f1 * n2 + f2 * n1)
             store(B, r + 5, f0 * n2 + f2 * n0)
-    row = at
+    row = q
     for r in range(9):
         for v in range(6):
             total = load(D, 6 * v) * load(B, 6 * r)
@@ -338,7 +356,7 @@ def nominal_moduli(F, directions, first, D, S, weight, finite, A, at):
             for v in range(1, 6):
                 total = total + load(T, v) * load(B, 6 * s + v)
             store(A, row, total)
-            row += 1
+            row += Q
     for d in range(3):
         for j in range(3):
             total = load(S, VOIGT[j, 0]) * load(directions, first + 3 * d)
@@ -350,5 +368,5 @@ def nominal_moduli(F, directions, first, D, S, weight, finite, A, at):
             total = total + load(T, 1) * load(directions, first + 3 * e + 1)
             total = total + load(T, 2) * load(directions, first + 3 * e + 2)
             for i in range(3):
-                row = at + PAIR[3 * i + d, 3 * i + e]
+                row = Q * PAIR[3 * i + d, 3 * i + e] + q
                 store(A, row, load(A, row) + total)

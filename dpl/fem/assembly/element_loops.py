@@ -19,11 +19,12 @@ from dpl.fem.assembly.lanes import (
     gather,
     gather_constants,
     gather_frame,
-    gradients_of_cell,
+    gradient,
     keep_minimum,
     rows,
     scatter,
     scatter_entries,
+    slopes_of_cell,
     stiffness_of_cell,
 )
 from dpl.fem.assembly.simd import SIMD_WIDTH, load, registers, sqrt, store
@@ -31,7 +32,6 @@ from dpl.fem.assembly.volume_loops import (
     add_projected,
     add_volumetric_stiffness,
     pressures_of_cells,
-    set_slopes,
     value_of,
 )
 
@@ -44,7 +44,7 @@ def add_system(
     law, c, frames, needs, finite, u, gap, cells, reference, inverse, dV, volumes, places, force,
     values,
 ):  # fmt: skip
-    """Add force to (N, D) and, unless empty, tangent to (nnz + 1,) at displacements u (N, D).
+    """Add force to (N, D) and, unless empty, tangent to (nnz + SPARE,) at displacements u (N, D).
 
     `cells` are the nodes of each cell, (blocks, A, SIMD_WIDTH), and the number of cells. The
     constants of the law are (E, n), or (1, n) for all cells, the fibre frames (E or 1, Q or 1, 9),
@@ -69,8 +69,8 @@ def add_system(
     else:
         ue, fe, G, P = rows(3 * n), rows(3 * n), rows(9 * Q), rows(9 * Q)
         A, K = rows(Q * point.PAIRS), rows(places.shape[1])
-    H, F, D, low = registers(9), registers(9), registers(36), registers(1)
-    e, X, S, ahead = registers(6), registers(6), registers(6), registers(6)
+    H, F, T, D, low = registers(9), registers(9), registers(9), registers(36), registers(1)
+    e, X, Y, S, ahead = registers(6), registers(6), registers(6), registers(6), registers(6)
     constants = rows(c.shape[1] + frames.shape[2])
     store(low, 0, np.inf)
     if volumes is not None:
@@ -84,23 +84,23 @@ def add_system(
         count = min(SIMD_WIDTH, n_cells - start)
         gather(u, numbers[block], dim, ue)
         gather_constants(c, start, count, constants)
-        gradients_of_cell(reference, inverse, block, Q, ue, G)
+        slopes_of_cell(reference, ue, G)
         if volumes is not None:
             gather_constants(stays, start, count, bulk)
             functions = psi[block if len(psi) > 1 else 0]
             weights = dV[block if len(dV) > 1 else 0]
             own = volume_gap[block] if mixed else no_gap
             pressures_of_cells(
-                *(law, constants, needs, finite, G, weights, functions, bulk, own, work),
-                *(pressures, low),
+                *(law, constants, needs, finite, G, inverse, block, weights, functions, bulk),
+                *(own, work, pressures, low),
             )
         for q in range(Q):
-            gather_frame(frames, q, start, count, constants)
-            weight = load(dV, first_row(dV, block, q))
+            first, weight = first_row(inverse, block, q), load(dV, first_row(dV, block, q))
+            if numba_laws.has_fibres(law):
+                gather_frame(frames, q, start, count, constants)
+            gradient(G, q, inverse, first, H)
             for r in range(9):
-                h = load(G, 9 * q + r)
-                store(H, r, h)
-                store(F, r, finite * h + (1.0 if r % 4 == 0 else 0.0))
+                store(F, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
             point.strain(H, finite, e)
             change = point.volume_change(H)
             J = 1.0 + finite * change
@@ -126,26 +126,29 @@ def add_system(
             if volumes is not None:
                 if mixed:
                     point.strain(H, finite, e)
-                    point.invert(e, X)
+                    point.invert(e, X, Y)
                 p, p_ahead, _ = pressures
                 for pressure, own_S, own_D in ((p_ahead, ahead, False), (p, S, moduli)):
                     value = value_of(pressure, functions[q])
                     point.add_pressure(value, 0.0, J, X, finite, own_S, D, own_D)
                 if moduli:
-                    set_slopes(F, X, J, finite, weight, functions[q], q, stresses)
-            point.nominal_stress(F, ahead, weight, P, 9 * q)
+                    point.volume_slope(F, X, J, finite, T)
+                    point.along(T, inverse, first, H, 0)
+                    for m in range(M):
+                        factor = weight * load(functions[q], m)
+                        for r in range(9):
+                            store(stresses[m], 9 * q + r, factor * load(H, r))
+            point.nominal_stress(F, ahead, weight, T)
+            point.along(T, inverse, first, P, 9 * q)
             if moduli:
-                first = first_row(inverse, block, q)
-                point.nominal_moduli(
-                    F, inverse, first, D, S, weight, finite, A, point.PAIRS * q
-                )
-        forces_of_cell(reference, inverse, block, Q, P, fe)
+                point.nominal_moduli(F, inverse, first, D, S, weight, finite, A, q, Q)
+        forces_of_cell(reference, P, fe)
         scatter(fe, numbers[block], count, force, dim)
         if moduli:
             stiffness_of_cell(reference, A, dim, K)
             if volumes is not None:
                 for m in range(M):
-                    forces_of_cell(reference, inverse, block, Q, stresses[m], slopes[m])
+                    forces_of_cell(reference, stresses[m], slopes[m])
                 add_volumetric_stiffness(slopes, pressures[2], dim, CV, K)
             scatter_entries(K, places[block], values)
     lowest = np.inf
@@ -168,29 +171,28 @@ def update_gap(law, gap, length, update, u, cells, reference, inverse, dV, psi):
     M = 0 if psi is None else psi.shape[2]
     strains = np.zeros((blocks, Q, 6, SIMD_WIDTH))
     volumes = np.zeros((blocks, M, SIMD_WIDTH))
-    ue, G, H = rows(3 * n), rows(9 * Q), registers(9)
-    if psi is not None:
-        at, deformed, F = rows(3 * n), rows(9 * Q), registers(9)
+    ue, G, H, F = rows(3 * n), rows(9 * Q), registers(9), registers(9)
+    at, deformed = rows(3 * n), rows(9 * Q)
     for block in range(blocks):
         gather(update, numbers[block], dim, ue)
-        gradients_of_cell(reference, inverse, block, Q, ue, G)
+        slopes_of_cell(reference, ue, G)
         if psi is not None:
             gather(u, numbers[block], dim, at)
-            gradients_of_cell(reference, inverse, block, Q, at, deformed)
+            slopes_of_cell(reference, at, deformed)
             if len(volume_gap) > 0:
                 for m in range(M):
                     store(volumes[block], m, (1.0 - length) * load(volume_gap[block], m))
         for q in range(Q):
-            own = strains[block, q]
+            own, first = strains[block, q], first_row(inverse, block, q)
             if len(strain_gap) > 0:
                 for v in range(6):
                     store(own, v, (1.0 - length) * load(strain_gap[block, q], v))
+            gradient(G, q, inverse, first, H)
             for r in range(9):
-                store(H, r, length * load(G, 9 * q + r))
+                store(H, r, length * load(H, r))
             point.quadratic(H, 1.0, own)
             if psi is not None:
-                for r in range(9):
-                    store(F, r, load(deformed, 9 * q + r))
+                gradient(deformed, q, inverse, first, F)
                 weight = load(dV, first_row(dV, block, q))
                 change = point.second_volume_change(F, H)
                 functions = psi[block if len(psi) > 1 else 0]

@@ -26,6 +26,7 @@ Gap = Array | tuple[Array, Array]  # of strains, with mean dilatation of strains
 NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH))
 NO_VOLUME_GAP = np.zeros((0, 0, SIMD_WIDTH))
 NO_VALUES = np.zeros(0)
+SPARE = 64  # places for entries that are not stored: additions to one place wait for each other
 AFFINE = 1e-13  # relative change of the inverse Jacobian in a cell that counts as rounding
 
 
@@ -52,8 +53,8 @@ class Kernels:
             reference: Gradients of the shape functions of the reference element, (Q, A, D).
             dN: Those of the cells, (E or 1, Q, A, D), reference times inverse Jacobian.
             dV: Volumes of the quadrature points, (E or 1, Q).
-            places: Position of each entry of a cell matrix among the nnz + 1 values, the last one
-                for entries that are not stored, (E, A (A + 1)/2 D^2).
+            places: Position of each entry of a cell matrix among the nnz entries, nnz for those
+                that are not stored, (E, A (A + 1)/2 D^2).
             functions: Functions of the volume change of mean dilatation, (E or 1, Q, M).
         """
         trilinear = lanes.trilinear_gradients()
@@ -69,8 +70,11 @@ class Kernels:
         self.inverse = _in_blocks(inverse.reshape(*inverse.shape[:2], 9))
         self.dV = _in_blocks(dV[..., None])
         self.functions = None if functions is None else _in_blocks(functions)
-        self.places = _in_blocks(places).astype(np.uint32)
-        self.places[-1, :, (len(cells) - 1) % SIMD_WIDTH + 1 :] = places.max()  # not stored
+        blocks = _in_blocks(places).astype(np.uint32)
+        nnz = blocks.max()  # of entries that are not stored, which every cell matrix has
+        blocks[-1, :, (len(cells) - 1) % SIMD_WIDTH + 1 :] = nnz
+        spare = np.arange(blocks[0].size, dtype=np.uint32).reshape(blocks[0].shape) % SPARE
+        self.places = np.where(blocks == nnz, nnz + spare, blocks)
         self._n_cells = len(cells)
         self._law: Any = None
         self._set_law(material)
@@ -103,7 +107,7 @@ class Kernels:
         return self._add(member, u, None, out, NO_VALUES)
 
     def system(self, u: Array, gap: Gap | None, out: Array, values: Array) -> float:
-        """Add force (N, D) and tangent (nnz + 1,) at u; return min det C of mixed points.
+        """Add force (N, D) and tangent (nnz + SPARE,) at u; return min det C of mixed points.
 
         Raises:
             ValueError: The members of a batch have different moduli.
@@ -160,9 +164,9 @@ class CompiledLoops(NamedTuple):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return force (1, N, D), tangent (1, nnz) and min det C of the mixed points (1,)."""
         u = displacement[0].detach().contiguous().numpy()
-        force, values = np.zeros(u.shape), np.zeros(self.n_entries + 1)
+        force, values = np.zeros(u.shape), np.zeros(self.n_entries + SPARE)
         lowest = min(group.system(u, own, force, values) for group, own in self._with_gaps(gap))
-        tangent = torch.from_numpy(values[:-1])[None]
+        tangent = torch.from_numpy(values[: self.n_entries])[None]
         return torch.from_numpy(force)[None], tangent, torch.tensor([lowest])
 
     def update_strain_gap(

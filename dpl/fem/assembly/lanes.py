@@ -101,38 +101,30 @@ def first_row(array, block, q):
 
 
 @inlined
-def gradients_of_cell(reference, inverse, block, Q, ue, H):
-    """Set H (rows 9 q + 3 i + j) to the gradients of ue (rows 3 a + i) at Q points."""
+def slopes_of_cell(reference, ue, G):
+    """Set G (rows 9 q + 3 i + d) to the reference gradients of ue (rows 3 a + i) at the points."""
     if reference is None:
-        trilinear_slopes(ue, H)
+        trilinear_slopes(ue, G)
     else:
-        table_slopes(reference, ue, H)
-    for q in range(Q):
-        first = first_row(inverse, block, q)
-        for i in range(3):
-            at = 9 * q + 3 * i
-            h0, h1, h2 = load(H, at), load(H, at + 1), load(H, at + 2)
-            for j in range(3):
-                n = first + j
-                n0, n1, n2 = load(inverse, n), load(inverse, n + 3), load(inverse, n + 6)
-                store(H, at + j, h0 * n0 + h1 * n1 + h2 * n2)
+        table_slopes(reference, ue, G)
 
 
 @inlined
-def forces_of_cell(reference, inverse, block, Q, P, fe):
-    """Set fe (rows 3 a + i) to the nodal forces of P (rows 9 q + 3 i + j), which is overwritten.
+def gradient(G, q, inverse, first, H):
+    """Set H (rows 3 i + j) to the gradient at a point, its inverse Jacobian from row `first`."""
+    for i in range(3):
+        g0, g1, g2 = load(G, 9 * q + 3 * i), load(G, 9 * q + 3 * i + 1), load(G, 9 * q + 3 * i + 2)
+        for j in range(3):
+            n0, n1 = load(inverse, first + j), load(inverse, first + 3 + j)
+            store(H, 3 * i + j, g0 * n0 + g1 * n1 + g2 * load(inverse, first + 6 + j))
 
-    This is the transpose of `gradients_of_cell`.
+
+@inlined
+def forces_of_cell(reference, P, fe):
+    """Set fe (rows 3 a + i) to the nodal forces of P (rows 9 q + 3 i + d).
+
+    P are the stresses between components and the directions of the reference element.
     """
-    for q in range(Q):
-        first = first_row(inverse, block, q)
-        for i in range(3):
-            at = 9 * q + 3 * i
-            p0, p1, p2 = load(P, at), load(P, at + 1), load(P, at + 2)
-            for d in range(3):
-                n = first + 3 * d
-                n0, n1, n2 = load(inverse, n), load(inverse, n + 1), load(inverse, n + 2)
-                store(P, at + d, p0 * n0 + p1 * n1 + p2 * n2)
     if reference is None:
         trilinear_forces(P, fe)
     else:
@@ -143,7 +135,7 @@ def forces_of_cell(reference, inverse, block, Q, P, fe):
 def stiffness_of_cell(reference, A, dim, K):
     """Set K, rows (pair of nodes a <= b, i, k), to the sum over the points of the moduli A.
 
-    The rows of A, (Q, PAIRS), are those of `constitutive_kernels.nominal_moduli` between the
+    The rows Q pair + q of A are those of `constitutive_kernels.nominal_moduli` between the
     directions of the reference element.
     """
     if reference is None:
@@ -190,18 +182,18 @@ def table_forces(reference, P, fe):
 @inlined
 def table_stiffness(reference, A, dim, K):
     """Set K to the sum of g_a A g_b over the points, g the reference gradients of the nodes."""
-    C = registers(27)
+    C, Q = registers(27), reference.shape[0]
     for r in range(K.shape[0]):
         store(K, r, 0.0)
-    for q in range(reference.shape[0]):
+    for q in range(Q):
         first = 0
         for b in range(reference.shape[1]):
             g0, g1, g2 = reference[q, b, 0], reference[q, b, 1], reference[q, b, 2]
             for r in range(9):
                 for k in range(3):
-                    c = load(A, PAIRS * q + PAIR[r, 3 * k]) * g0
-                    c = c + load(A, PAIRS * q + PAIR[r, 3 * k + 1]) * g1
-                    c = c + load(A, PAIRS * q + PAIR[r, 3 * k + 2]) * g2
+                    c = load(A, Q * PAIR[r, 3 * k] + q) * g0
+                    c = c + load(A, Q * PAIR[r, 3 * k + 1] + q) * g1
+                    c = c + load(A, Q * PAIR[r, 3 * k + 2] + q) * g2
                     store(C, 3 * r + k, c)
             for i in range(dim):
                 r = 9 * i
@@ -298,30 +290,31 @@ def trilinear_stiffness(A, K):
     c, M = registers(8), registers(64)
     for r in range(PAIRS):
         for p in range(8):
-            store(c, p, load(A, PAIRS * POINT[p] + r))
+            store(c, p, load(A, 8 * r + POINT[p]))
         hadamard(c, 1)
         for p in range(8):
-            store(A, PAIRS * p + r, load(c, p))
+            store(A, 8 * r + p, load(c, p))
     for i in range(3):
         for k in range(i, 3):
-            for r in range(64):
-                store(M, r, 0.0)
-            for d in range(3):
-                for e in range(3):
-                    at = PAIR[3 * i + d, 3 * k + e]
-                    for m in range(4):
-                        for n in range(4):
-                            x, y = SUBSETS[d, m], SUBSETS[e, n]
-                            r = 8 * (x | 1 << d) + (y | 1 << e)
-                            store(M, r, load(M, r) + load(A, PAIRS * (x ^ y) + at))
-            for y in range(1, 8):
+            for y in range(1, 8):  # the function of the second node
                 for x in range(8):
-                    store(c, x, load(M, 8 * x + y) * (SIZES[x] * SIZES[y]))
+                    store(c, x, 0.0)
+                for e in range(3):
+                    if y >> e & 1:
+                        for d in range(3):
+                            at = 8 * PAIR[3 * i + d, 3 * k + e]
+                            for m in range(4):
+                                x, sign = SUBSETS[d, m], SUBSETS[d, m] ^ y ^ (1 << e)
+                                total = load(c, x | 1 << d) + load(A, at + sign)
+                                store(c, x | 1 << d, total)
+                for x in range(8):
+                    store(c, x, load(c, x) * (SIZES[x] * SIZES[y]))
                 hadamard(c, -1)
                 for a in range(8):
                     store(M, 8 * a + y, load(c, a))
             for a in range(8):
-                for y in range(8):
+                store(c, 0, 0.0)
+                for y in range(1, 8):
                     store(c, y, load(M, 8 * a + y))
                 hadamard(c, -1)
                 for b in range(8):
@@ -346,7 +339,7 @@ def scatter(fe, nodes, count, force, dim):
 
 @inlined
 def scatter_entries(K, places, values):
-    """Add the entries of the matrices of a block of cells to values (nnz + 1,)."""
+    """Add the entries of the matrices of a block of cells to values (nnz + SPARE,)."""
     for r in range(places.shape[0]):
         for lane in range(SIMD_WIDTH):
             values[places[r, lane]] += K[r, lane]

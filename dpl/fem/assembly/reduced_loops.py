@@ -27,7 +27,7 @@ def set_moduli(law, c, needs, finite, H, A):
     for r in range(9):
         store(unit, r, 1.0 if r % 4 == 0 else 0.0)
         store(F, r, finite * load(H, r) + load(unit, r))
-    point.nominal_moduli(F, unit, 0, D, S, 1.0, finite, A, 0)
+    point.nominal_moduli(F, unit, 0, D, S, 1.0, finite, A, 0, 1)
 
 
 @inlined

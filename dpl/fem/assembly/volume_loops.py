@@ -5,7 +5,7 @@ See `dpl.fem.assembly.mean_dilatation`. Polynomials of the volume change are row
 """
 
 from dpl.fem.assembly import constitutive_kernels as point
-from dpl.fem.assembly.lanes import keep_minimum
+from dpl.fem.assembly.lanes import first_row, gradient, keep_minimum
 from dpl.fem.assembly.simd import inlined, load, registers, store
 
 
@@ -27,15 +27,15 @@ def add_projected(value, functions, out):
 
 @inlined
 def pressures_of_cells(
-    law, c, needs, finite, G, weights, functions, bulk, gap, j, out, low
+    law, c, needs, finite, G, inverse, block, weights, functions, bulk, gap, j, out, low
 ):  # fmt: skip
     """Set the coefficients of the pressures of a block of cells and their derivatives.
 
-    G (rows 9 q + 3 i + j) are the gradients of u. `functions` are those of the volume change, and
-    `bulk` is the bulk modulus that stays at the points. `out` are the pressure p (M, lane) at the
-    volume change of u minus `gap` (M, lane), or of u if there is none; its linear extrapolation to
-    the volume change of u; and the derivative of p (M M, lane). With a gap `low` becomes its
-    minimum with the volume changes.
+    G (rows 9 q + 3 i + d) are the reference gradients of u. `functions` are those of the volume
+    change, and `bulk` is the bulk modulus that stays at the points. `out` are the pressure p
+    (M, lane) at the volume change of u minus `gap` (M, lane), or of u if there is none; its linear
+    extrapolation to the volume change of u; and the derivative of p (M M, lane). With a gap `low`
+    becomes its minimum with the volume changes.
     """
     p, ahead, D = out
     M, mixed, H = functions.shape[1], len(gap) > 0, registers(9)
@@ -43,8 +43,7 @@ def pressures_of_cells(
         part[:] = 0.0
     j[:] = 0.0
     for q in range(functions.shape[0]):
-        for r in range(9):
-            store(H, r, load(G, 9 * q + r))
+        gradient(G, q, inverse, first_row(inverse, block, q), H)
         add_projected(load(weights, q) * point.change_of_volume(H, finite), functions[q], j)
     if mixed:
         for m in range(M):
@@ -63,18 +62,8 @@ def pressures_of_cells(
 
 
 @inlined
-def set_slopes(F, X, J, finite, weight, psi, q, stresses):
-    """Set the rows 9 q + 3 i + j of stresses[m] to dJ/dF times a function of the point."""
-    slope = registers(9)
-    point.volume_slope(F, X, J, finite, slope)
-    for m in range(stresses.shape[0]):
-        for r in range(9):
-            store(stresses[m], 9 * q + r, weight * load(psi, m) * load(slope, r))
-
-
-@inlined
 def add_volumetric_stiffness(slopes, D, dim, C, K):
-    """Add slopes D slopes^T to K, see `add_stiffness`."""
+    """Add slopes D slopes^T to K, see `stiffness_of_cell`."""
     M = slopes.shape[0]
     for m in range(M):
         for r in range(slopes.shape[1]):
