@@ -5,16 +5,17 @@ functions are compiled into the loops of `dpl.fem.assembly.element_loops`.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpl.fem.assembly.numba_laws import derivatives_of, has_fibres, set_fibre_derivatives
-from dpl.fem.assembly.simd import expm1, inlined, load, log1p, registers, sqrt, store
+from dpl.fem.assembly.simd import expm1, inlined, load, log1p, nonzero, registers, sqrt, store
 
 VOIGT = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
 FIRST = np.array([0, 1, 2, 0, 1, 0])  # the two indices of each Voigt index
 SECOND = np.array([0, 1, 2, 1, 2, 2])
 
 
-def _upper_triangle(size: int) -> np.ndarray:
+def _upper_triangle(size: int) -> NDArray[np.int64]:
     """Return the number of each entry (size, size) in the upper triangle of a symmetric matrix."""
     numbers = np.zeros((size, size), dtype=np.int64)
     numbers[np.triu_indices(size)] = np.arange(size * (size + 1) // 2)
@@ -116,31 +117,37 @@ def invert(e, X, Y):
 
 
 @inlined
+def derivatives_at(law, c, needs, i1, e, j):
+    """Return the invariant derivatives of a law at e with I1 - 3 = i1 and det F = 1 + j."""
+    e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
+    e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
+    i2 = 2.0 * i1 + (e1 * e2 - e4 * e4 + (e0 * e2 - e5 * e5) + (e0 * e1 - e3 * e3))
+    log_j, m1 = j, j
+    if needs > 1:
+        log_j = log1p(j)
+        if needs > 2:
+            m1 = expm1(-2 / 3 * log_j)
+    return derivatives_of(law, c, i1, i2, j, log_j, m1)
+
+
+@inlined
 def stress(law, c, needs, e, j, X, S, D, moduli):
     """Set S and X = C^-1, and with `moduli` D = dS/dE (rows 6 I + J), at e with det F = 1 + j.
 
     The constants c are rows of vectors. The stress of laws with ln J is NaN where det F is
     negative.
     """
-    e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
-    e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
-    i1 = e0 + e1 + e2
-    i2 = 2.0 * i1 + (e1 * e2 - e4 * e4 + (e0 * e2 - e5 * e5) + (e0 * e1 - e3 * e3))
     Y = registers(6)
     if needs > 0:
         invert(e, X, Y)
-    log_j, m1 = j, j
-    if needs > 1:
-        log_j = log1p(j)
-        if needs > 2:
-            m1 = expm1(-2 / 3 * log_j)
-    derivatives = derivatives_of(law, c, i1, i2, j, log_j, m1)
+    i1 = load(e, 0) + load(e, 1) + load(e, 2)
+    derivatives = derivatives_at(law, c, needs, i1, e, j)
     rest, W2, p = derivatives[:3]
     pressure = rest + 2.0 * W2 * i1
     for v in range(6):
-        stress = -2.0 * W2 * load(e, v)
-        if v < 3:
-            stress = stress + pressure
+        stress = pressure if v < 3 else 0.0 * pressure
+        if nonzero(W2):
+            stress = stress - 2.0 * W2 * load(e, v)
         if needs > 0:
             stress = stress - p * load(Y, v)
         store(S, v, stress)
@@ -312,6 +319,50 @@ def along(P, directions, first, out, at):
             n = first + 3 * d
             n0, n1, n2 = load(directions, n), load(directions, n + 1), load(directions, n + 2)
             store(out, at + 3 * i + d, p0 * n0 + p1 * n1 + p2 * n2)
+
+
+@inlined
+def cofactor(H, i, j):
+    """Return the entry i, j of the cofactors of H."""
+    k, m, a, b = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+    minor = load(H, 3 * k + a) * load(H, 3 * m + b)
+    return minor - load(H, 3 * k + b) * load(H, 3 * m + a)
+
+
+@inlined
+def isotropic_stress(law, c, needs, finite, H, j, weight, P):
+    """Set P to what `stress` and `nominal_stress` give for a law without fibres, with fewer terms.
+
+    F C^-1 is the transposed inverse of F, and F minus it is made of H without rounding 1 + H.
+    """
+    e = registers(6)
+    strain(H, finite, e)  # only of laws with I2 or W2; LLVM removes it for others
+    trace, square = load(H, 0) + load(H, 4) + load(H, 8), load(H, 0) * load(H, 0)
+    for r in range(1, 9):
+        square = square + load(H, r) * load(H, r)
+    i1 = 2.0 * trace + finite * square
+    rest, W2, p = derivatives_at(law, c, needs, i1, e, j)[:3]
+    pressure = weight * (rest + 2.0 * W2 * i1)
+    for r in range(9):
+        store(P, r, finite * pressure * load(H, r) + (1.0 if r % 4 == 0 else 0.0) * pressure)
+    if nonzero(W2):
+        factor = 2.0 * weight * W2
+        for i in range(3):
+            h0, h1 = finite * load(H, 3 * i), finite * load(H, 3 * i + 1)
+            h2 = finite * load(H, 3 * i + 2)
+            for k in range(3):
+                v0, v1, v2 = VOIGT[0, k], VOIGT[1, k], VOIGT[2, k]
+                product = h0 * load(e, v0) + h1 * load(e, v1) + h2 * load(e, v2)
+                product = product + load(e, VOIGT[i, k])
+                store(P, 3 * i + k, load(P, 3 * i + k) - factor * product)
+    if needs > 0:
+        factor = weight * p / (1.0 + j)
+        for i in range(3):
+            for k in range(3):
+                change = load(H, 3 * i + k) * (1.0 + j) + load(H, 3 * k + i) - cofactor(H, i, k)
+                if i == k:
+                    change = change + (j - trace)
+                store(P, 3 * i + k, load(P, 3 * i + k) - factor * change)
 
 
 @inlined

@@ -72,9 +72,11 @@ def add_system(
     H, F, T, D, low = registers(9), registers(9), registers(9), registers(36), registers(1)
     e, X, Y, S, ahead = registers(6), registers(6), registers(6), registers(6), registers(6)
     constants = rows(c.shape[1] + frames.shape[2])
+    plain = not (mixed or moduli or numba_laws.has_fibres(law))
     store(low, 0, np.inf)
     if volumes is not None:
         psi, stays = volumes
+        plain = False
         M = psi.shape[2]
         slopes, stresses = np.zeros((M, 3 * n, SIMD_WIDTH)), np.zeros((M, 9 * Q, SIMD_WIDTH))
         pressures, bulk = (rows(M), rows(M), rows(M * M)), rows(1)
@@ -99,10 +101,15 @@ def add_system(
             if numba_laws.has_fibres(law):
                 gather_frame(frames, q, start, count, constants)
             gradient(G, q, inverse, first, H)
+            change = point.volume_change(H)
+            if plain:
+                keep_minimum(change, low)
+                point.isotropic_stress(law, constants, needs, finite, H, change, weight, T)
+                point.along(T, inverse, first, P, 9 * q)
+                continue
             for r in range(9):
                 store(F, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
             point.strain(H, finite, e)
-            change = point.volume_change(H)
             J = 1.0 + finite * change
             if mixed:
                 change = point.reduce_strain(strain_gap[block, q], e)

@@ -10,6 +10,7 @@ coefficients that a Hadamard transform gives, and du/dx has the same value at tw
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from dpl.fem.assembly.constitutive_kernels import PAIR, PAIRS
 from dpl.fem.assembly.simd import SIMD_WIDTH, choose, inlined, load, registers, store
@@ -23,7 +24,7 @@ SUBSETS = np.array([[0, 2, 4, 6], [0, 1, 4, 5], [0, 1, 2, 3]])  # without one of
 _BITS = np.arange(8)[:, None] >> np.arange(3) & 1
 
 
-def _entries():
+def _entries() -> NDArray[np.int64]:
     """Return the row of K of nodes with the bits a, b and components i, k, (3 i + k, 8 a + b)."""
     found = np.empty((3, 3, 8, 8), dtype=np.int64)
     for i, k, a, b in np.ndindex(found.shape):
@@ -35,7 +36,7 @@ def _entries():
 ENTRY = _entries()
 
 
-def trilinear_gradients():
+def trilinear_gradients() -> NDArray[np.float64]:
     """Return the reference gradients of the trilinear hexahedron times 4, (8, 8, 3)."""
     nodes, points = np.empty((8, 3)), np.empty((8, 3))
     nodes[NODE], points[POINT] = 2 * _BITS - 1, GAUSS * (2 * _BITS - 1)

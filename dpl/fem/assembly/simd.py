@@ -174,9 +174,11 @@ def log1p(x):
     f = _fma(scale, x, scale - 1.0)  # 1 + x is not rounded
     s = f / (2.0 + f)
     square = s * s
-    series = square * (1 / 21)
-    for n in range(9, 0, -1):
-        series = (series + 1 / (2 * n + 1)) * square
+    fourth = square * square
+    odd, even = fourth * (1 / 19), fourth * (1 / 21)  # independent sums
+    for n in range(3, 0, -1):
+        odd, even = (odd + 1 / (4 * n + 3)) * fourth, (even + 1 / (4 * n + 5)) * fourth
+    series = square * (odd + 1 / 3) + fourth * (even + 1 / 5)
     return choose(-1.0, x, k * math.log(2.0) + (2.0 * s + 2.0 * s * series), math.nan)
 
 
@@ -190,6 +192,16 @@ def expm1(x):
         series = 1.0 + r * (1 / k) * series
     scale = _power_of_two(n)
     return _fma(scale, r * series, scale - 1.0)
+
+
+def nonzero(x):
+    """Return True for a vector and for numbers except 0.0; callable in compiled code only."""
+    raise NotImplementedError
+
+
+@overload(nonzero)
+def _overloaded_nonzero(x):
+    return (lambda x: True) if isinstance(x, SIMDVector) else (lambda x: x != 0.0)
 
 
 @overload(arithmetic.exp)
