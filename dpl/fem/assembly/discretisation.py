@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.assembly.elements import basis_of
+from dpl.fem.assembly.elements import basis_of, reference_gradients
 from dpl.fem.assembly.kernels import CompiledLoops, Kernels
 from dpl.fem.assembly.mean_dilatation import CellVolumes
 from dpl.fem.assembly.recovery import Recovery
@@ -93,17 +93,26 @@ class Discretisation:
 
     def _loop(self, chosen: Tensor, law: Material) -> Kernels:
         """Return the loops over some cells, which share the arrays of their first law."""
-        # An index by numbers copies: sending a problem to a worker moves the memory of tensors.
         numbers = chosen.numpy()
         key = numbers.tobytes()
         if key not in self._kernels:
             own = [0] if self.equal_cells else numbers
-            dN, dV = self.dN.numpy()[own], self.dV.numpy()[own]
             psi = None if self.volume_functions is None else self.volume_functions.numpy()[own]
-            places = self.pattern.places.reshape(len(self.cells), -1)[numbers]
-            cells = self.cells.numpy()[numbers]
-            self._kernels[key] = Kernels(law, cells, dN, dV, places, psi)
+            self._kernels[key] = Kernels(
+                law,
+                cells=self.cells.numpy()[numbers],
+                reference=self._reference,
+                dN=self.dN.numpy()[own],
+                dV=self.dV.numpy()[own],
+                places=self.pattern.places.reshape(len(self.cells), -1)[numbers],
+                functions=psi,
+            )
         return self._kernels[key].with_law(law)
+
+    @cached_property
+    def _reference(self) -> NDArray[np.float64]:
+        """Gradients of the shape functions of the reference element, (Q, A, D)."""
+        return reference_gradients(self.mesh, self.degree)
 
     @cached_property
     def _kernels(self) -> dict[bytes, Kernels]:

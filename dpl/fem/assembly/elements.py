@@ -3,9 +3,11 @@
 import numpy as np
 import skfem
 from numpy.typing import NDArray
+from skfem.quadrature import get_quadrature
 
 from dpl.fem.mesh.generators import aspect_ratio
 
+Array = NDArray[np.float64]
 # shape of the cell, degree -> element, polynomial degree that the quadrature integrates exactly.
 # Full integration: fewer points leave hourglass modes.
 ELEMENTS = {
@@ -45,6 +47,19 @@ def basis_of(mesh: skfem.Mesh, degree: int) -> skfem.Basis:
     Raises:
         ValueError: There is no element for the shape of the cells.
     """
+    element, quadrature = _element_of(mesh, degree)
+    return skfem.Basis(mesh, element, quadrature=quadrature)
+
+
+def reference_gradients(mesh: skfem.Mesh, degree: int) -> Array:
+    """Return the gradients of the shape functions of the reference element, (Q, A, D)."""
+    element, (points, _) = _element_of(mesh, degree)
+    count = len(element.doflocs)
+    return np.stack([element.lbasis(points, a)[1] for a in range(count)]).transpose(2, 0, 1)
+
+
+def _element_of(mesh: skfem.Mesh, degree: int) -> tuple[skfem.Element, tuple[Array, Array]]:
+    """Return element and quadrature, points (D, Q) and weights (Q,), of `basis_of`."""
     shape = mesh.elem.refdom.name
     if (shape, degree) not in ELEMENTS:
         raise ValueError(
@@ -52,11 +67,10 @@ def basis_of(mesh: skfem.Mesh, degree: int) -> skfem.Basis:
         )
     element, order = ELEMENTS[shape, degree]
     if (shape, degree) == ("Triangular", 1):  # scikit-fem's smallest rule has three points
-        centre = np.array([[1 / 3], [1 / 3]]), np.array([1 / 2])
-        return skfem.Basis(mesh, element(), quadrature=centre)
+        return element(), (np.array([[1 / 3], [1 / 3]]), np.array([1 / 2]))
     if (shape, degree) == ("Tetrahedral", 2) and _curved(mesh):
-        return skfem.Basis(mesh, element(), quadrature=_curved_rule())
-    return skfem.Basis(mesh, element(), intorder=order)
+        return element(), _curved_rule()
+    return element(), get_quadrature(element.refdom, order)
 
 
 def _curved(mesh: skfem.Mesh) -> bool:
@@ -68,7 +82,7 @@ def _curved(mesh: skfem.Mesh) -> bool:
     return bool((change > STRAIGHT * np.abs(J).max(axis=(0, 1, 3))).any())
 
 
-def _curved_rule() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _curved_rule() -> tuple[Array, Array]:
     """Return points (3, 8) and weights (8,) of degree 3 on the reference tetrahedron.
 
     In curved cells the gradient of a shape function times det J is cubic.
@@ -77,7 +91,7 @@ def _curved_rule() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.hstack(points), np.repeat([share / 6 for _, share in CURVED], 4)
 
 
-def gradients(basis: skfem.Basis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def gradients(basis: skfem.Basis) -> tuple[Array, Array]:
     """Return dN (E, Q, A, D) and dV (E, Q) of a basis; with E = 1 if all cells are equal."""
     stacked = np.stack([b[0].grad for b in basis.basis])  # (A, D, E, Q)
     dN, dV = stacked.transpose(2, 3, 0, 1), basis.dx

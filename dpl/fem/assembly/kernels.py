@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.assembly import element_loops
+from dpl.fem.assembly import element_loops, lanes
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.material import CompiledForm, Material
@@ -26,6 +26,8 @@ Gap = Array | tuple[Array, Array]  # of strains, with mean dilatation of strains
 NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH))
 NO_VOLUME_GAP = np.zeros((0, 0, SIMD_WIDTH))
 NO_VALUES = np.zeros(0)
+SPARE = 64  # places for entries that are not stored: additions to one place wait for each other
+AFFINE = 1e-13  # relative change of the inverse Jacobian in a cell that counts as rounding
 
 
 class Kernels:
@@ -35,27 +37,45 @@ class Kernels:
         self,
         material: Material,
         cells: NDArray[np.int64],
+        reference: Array,
         dN: Array,
         dV: Array,
         places: NDArray[np.int32],
         functions: Array | None = None,
     ) -> None:
-        """Store the arrays; numba compiles at the first call and caches the code on disk.
+        """Copy the arrays in blocks; numba compiles at the first call and caches the code on disk.
+
+        They are copies because sending a problem to a worker moves the memory of its tensors.
 
         Args:
             material: The law, which has a `compiled_form`.
             cells: Nodes of each cell, (E, A).
-            dN: Gradients of the shape functions, (E or 1, Q, A, D).
+            reference: Gradients of the shape functions of the reference element, (Q, A, D).
+            dN: Those of the cells, (E or 1, Q, A, D), reference times inverse Jacobian.
             dV: Volumes of the quadrature points, (E or 1, Q).
-            places: Position of each entry of a cell matrix among the nnz + 1 values, the last one
-                for entries that are not stored, (E, A (A + 1)/2 D^2).
+            places: Position of each entry of a cell matrix among the nnz entries, nnz for those
+                that are not stored, (E, A (A + 1)/2 D^2).
             functions: Functions of the volume change of mean dilatation, (E or 1, Q, M).
         """
-        self.cells = cells
-        self.dN = dN
-        self.dV = dV
-        self.places = _in_blocks(places)
-        self.functions = None if functions is None else np.ascontiguousarray(functions)
+        trilinear = lanes.trilinear_gradients()
+        same = reference.shape == trilinear.shape and np.allclose(4 * reference, trilinear)
+        reference = trilinear if same else reference
+        inverse = np.linalg.pinv(reference) @ dN
+        if np.allclose(inverse, inverse[:, :1], rtol=0, atol=AFFINE * np.abs(inverse).max()):
+            inverse = inverse[:, :1]
+        missing = 3 - dN.shape[-1]
+        inverse = np.pad(inverse, [(0, 0), (0, 0), (0, missing), (0, missing)])
+        self.cells = _in_blocks(cells).astype(np.uint32)
+        self.reference = None if same else np.pad(reference, [(0, 0), (0, 0), (0, missing)])
+        self.inverse = _in_blocks(inverse.reshape(*inverse.shape[:2], 9))
+        self.dV = _in_blocks(dV[..., None])
+        self.functions = None if functions is None else _in_blocks(functions)
+        blocks = _in_blocks(places).astype(np.uint32)
+        nnz = blocks.max()  # of entries that are not stored, which every cell matrix has
+        blocks[-1, :, (len(cells) - 1) % SIMD_WIDTH + 1 :] = nnz
+        spare = np.arange(blocks[0].size, dtype=np.uint32).reshape(blocks[0].shape) % SPARE
+        self.places = np.where(blocks == nnz, nnz + spare, blocks)
+        self._n_cells = len(cells)
         self._law: Any = None
         self._set_law(material)
 
@@ -87,7 +107,7 @@ class Kernels:
         return self._add(member, u, None, out, NO_VALUES)
 
     def system(self, u: Array, gap: Gap | None, out: Array, values: Array) -> float:
-        """Add force (N, D) and tangent (nnz + 1,) at u; return min det C of mixed points.
+        """Add force (N, D) and tangent (nnz + SPARE,) at u; return min det C of mixed points.
 
         Raises:
             ValueError: The members of a batch have different moduli.
@@ -103,15 +123,19 @@ class Kernels:
         volumes = None
         if self._bulk is not None:
             volumes = self.functions, self._bulk[member if len(self._bulk) > 1 else 0]
-        body = self.cells, self.dN, self.dV, volumes, self.places
-        system = element_loops.add_system
         law_arguments = law, moduli, self._frames, needs, finite
-        return 1 + call_compiled(system, *law_arguments, u, _both(gap), *body, out, values)
+        arguments = *law_arguments, u, _both(gap), *self._body, volumes, self.places, out, values
+        return 1 + call_compiled(element_loops.add_system, *arguments)
+
+    @property
+    def _body(self) -> tuple[Any, ...]:
+        """Arguments of the loops: cells and their number, gradients and volumes."""
+        return (self.cells, self._n_cells), self.reference, self.inverse, self.dV
 
     def gap_after(self, gap: Gap | None, length: float, update: Array, u: Array) -> Gap:
         """Return the gaps of the mixed integration points after a step (N, D) to u (N, D)."""
-        kernel, body = element_loops.update_gap, (self.cells, self.dN, self.dV, self.functions)
-        both = call_compiled(kernel, self._law[0], _both(gap), length, update, u, *body)
+        arguments = self._law[0], _both(gap), length, update, u, *self._body, self.functions
+        both = call_compiled(element_loops.update_gap, *arguments)
         found: Gap = both[0] if self.functions is None else both
         return found
 
@@ -140,9 +164,9 @@ class CompiledLoops(NamedTuple):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return force (1, N, D), tangent (1, nnz) and min det C of the mixed points (1,)."""
         u = displacement[0].detach().contiguous().numpy()
-        force, values = np.zeros(u.shape), np.zeros(self.n_entries + 1)
+        force, values = np.zeros(u.shape), np.zeros(self.n_entries + SPARE)
         lowest = min(group.system(u, own, force, values) for group, own in self._with_gaps(gap))
-        tangent = torch.from_numpy(values[:-1])[None]
+        tangent = torch.from_numpy(values[: self.n_entries])[None]
         return torch.from_numpy(force)[None], tangent, torch.tensor([lowest])
 
     def update_strain_gap(
@@ -249,9 +273,8 @@ def _announce() -> None:
     print(COMPILING, file=sys.stderr, flush=True)
 
 
-def _in_blocks(places: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return an array (E, entries) as (blocks, entries, SIMD_WIDTH), padded with zeros."""
-    blocks = -(-len(places) // SIMD_WIDTH)
-    padded = np.zeros((blocks * SIMD_WIDTH, places.shape[1]), dtype=np.int32)
-    padded[: len(places)] = places
-    return np.ascontiguousarray(padded.reshape(blocks, SIMD_WIDTH, -1).transpose(0, 2, 1))
+def _in_blocks(values: NDArray[Any]) -> NDArray[Any]:
+    """Return an array (E, ...) as (blocks, ..., SIMD_WIDTH), the last cell repeated."""
+    blocks = -(-len(values) // SIMD_WIDTH)
+    cell = np.minimum(np.arange(blocks * SIMD_WIDTH), len(values) - 1).reshape(blocks, -1)
+    return np.ascontiguousarray(np.moveaxis(values[cell], 1, -1))

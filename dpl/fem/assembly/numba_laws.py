@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, types
+from numba import types
 from numba.extending import NativeValue, models, overload, register_model, typeof_impl, unbox
 
-from dpl.fem.assembly.simd import load, store
+from dpl.fem.assembly.simd import inlined, load, store
 from dpl.fem.materials import arithmetic
 from dpl.fem.materials.material import CompiledForm
 
@@ -154,7 +154,7 @@ def _compile(function: Any) -> Any:
     for name, value in _globals(function).items():
         if _is_source(value):
             scope[name] = _compile(value)
-    return njit(type(function)(function.__code__, scope, function.__name__))
+    return inlined(type(function)(function.__code__, scope, function.__name__))
 
 
 @register_model(_LawType)
@@ -180,7 +180,7 @@ def derivatives_of(law, c, i1, i2, j, log_j, m1):
     raise NotImplementedError
 
 
-@overload(derivatives_of)
+@overload(derivatives_of, jit_options={"forceinline": True})
 def _overloaded(law, c, i1, i2, j, log_j, m1):
     return _COMPILED[law.name][0]
 
@@ -193,7 +193,7 @@ def set_fibre_derivatives(law, c, e, out, moduli):
     raise NotImplementedError
 
 
-@overload(set_fibre_derivatives)
+@overload(set_fibre_derivatives, jit_options={"forceinline": True})
 def _overloaded_fibres(law, c, e, out, moduli):
     # numba types the call for laws without fibres too; LLVM removes it
     return _COMPILED[law.name][1] or (lambda law, c, e, out, moduli: None)

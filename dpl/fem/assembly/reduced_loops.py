@@ -11,27 +11,35 @@ from numba import njit
 
 from dpl.fem.assembly import constitutive_kernels as point
 from dpl.fem.assembly import element_loops
-from dpl.fem.assembly.lanes import (
-    gather,
-    gather_constants,
-    gather_shape,
-    gradient,
-    rows,
-)
-from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
+from dpl.fem.assembly.lanes import gather_constants, rows
+from dpl.fem.assembly.simd import SIMD_WIDTH, inlined, load, registers, store
 
 SOURCES = element_loops.SOURCES + inspect.getsource(sys.modules[__name__])
 
 
-@njit
-def moduli(law, c, needs, finite, H, weight, work, A):
-    """Set A (rows ((i 3 + k) 3 + J) 3 + L) to dP_iJ/dF_kL times `weight`; H becomes F."""
-    e, X, S, T, scratch, D = work
+@inlined
+def set_moduli(law, c, needs, finite, H, A):
+    """Set A (rows of `PAIR`) to dP/dF at H."""
+    e, X, S, F = registers(6), registers(6), registers(6), registers(9)
+    D, unit = registers(36), registers(9)
     point.strain(H, finite, e)
-    point.stress(law, c, needs, e, point.volume_change(H), X, S, scratch, D, True)
+    point.stress(law, c, needs, e, point.volume_change(H), X, S, D, True)
     for r in range(9):
-        store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
-    point.push_forward(H, D, S, weight, finite, T, A)
+        store(unit, r, 1.0 if r % 4 == 0 else 0.0)
+        store(F, r, finite * load(H, r) + load(unit, r))
+    point.nominal_moduli(F, unit, 0, D, S, 1.0, finite, A, 0, 1)
+
+
+@inlined
+def set_gradients(u, cells, dN, start, count, H):
+    """Set H (rows 3 i + j) to the gradients of u in a block of cells with one point each."""
+    H[:] = 0.0
+    for lane in range(SIMD_WIDTH):
+        cell = start + min(lane, count - 1)
+        for a in range(cells.shape[1]):
+            for i in range(u.shape[1]):
+                for j in range(u.shape[1]):
+                    H[3 * i + j, lane] += u[cells[cell, a], i] * dN[cell, 0, a, j]
 
 
 @njit(error_model="numpy", cache=True)
@@ -42,20 +50,15 @@ def moduli_change_product(law, c, needs, finite, u, cells, dN, dV, basis, out):
     rows D i + J. The gradients dN are (C, 1, A, D), the volumes dV (C, 1), and the constants of the
     law (C, n), or (1, n) for all cells.
     """
-    n, dim, rank = cells.shape[1], dN.shape[3], basis.shape[2]
-    ue, g, weight = rows(3 * n), np.zeros((1, 3 * n, SIMD_WIDTH)), rows(1)
-    H, A, rest = rows(9), rows(81), rows(81)
-    work = rows(6), rows(6), rows(6), rows(6), rows(point.SCRATCH_ROWS), rows(36)
-    constants = rows(c.shape[1])
+    dim, rank = u.shape[1], basis.shape[2]
+    H, A, rest, constants = rows(9), rows(point.PAIRS), rows(point.PAIRS), rows(c.shape[1])
     for start in range(0, len(cells), SIMD_WIDTH):
         count = min(SIMD_WIDTH, len(cells) - start)
-        gather(u, cells, start, count, ue)
-        gather_shape(dN, dV, start, count, g, weight)
         gather_constants(c, start, count, constants)
         H[:] = 0.0
-        moduli(law, constants, needs, finite, H, load(weight, 0), work, rest)
-        gradient(ue, g[0], H)
-        moduli(law, constants, needs, finite, H, load(weight, 0), work, A)
+        set_moduli(law, constants, needs, finite, H, rest)
+        set_gradients(u, cells, dN, start, count, H)
+        set_moduli(law, constants, needs, finite, H, A)
         for lane in range(count):
             for i in range(dim):
                 for J in range(dim):
@@ -63,8 +66,9 @@ def moduli_change_product(law, c, needs, finite, u, cells, dN, dV, basis, out):
                     row[:] = 0
                     for k in range(dim):
                         for L in range(dim):
-                            at = ((3 * i + k) * 3 + J) * 3 + L
-                            change = np.float32(A[at, lane] - rest[at, lane])
+                            at = point.PAIR[3 * i + J, 3 * k + L]
+                            weight = dV[start + lane, 0]
+                            change = np.float32(weight * (A[at, lane] - rest[at, lane]))
                             other = basis[start + lane, dim * k + L]
                             for r in range(rank):
                                 row[r] += change * other[r]

@@ -5,18 +5,23 @@ do not overlap. A value of type `SIMDVector` is a vector register. `load` and `s
 of arrays (rows, SIMD_WIDTH); the operators + - * / take vectors and numbers.
 """
 
+import math
 import operator
 from typing import Any
 
 import llvmlite.binding as llvm
 from llvmlite import ir
-from numba import types
+from numba import njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
+from numba.np.arrayobj import populate_array
 
 from dpl.fem.materials import arithmetic
 
 SIMD_WIDTH = 8 if llvm.get_host_cpu_features().get("avx512f") else 4
 _VECTOR = ir.VectorType(ir.DoubleType(), SIMD_WIDTH)
+_INTEGERS = ir.VectorType(ir.IntType(64), SIMD_WIDTH)
+inlined = njit(forceinline=True, error_model="numpy")  # a part of the loop that calls it
 _FLAGS = ("contract", "reassoc", "nsz")  # allow fused multiply-adds, preserve NaN and infinity
 
 
@@ -38,6 +43,26 @@ def _pointer(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     row = context.cast(builder, args[1], signature.args[1], types.intp)
     first = builder.mul(row, ir.Constant(row.type, SIMD_WIDTH))
     return builder.bitcast(builder.gep(array.data, [first]), _VECTOR.as_pointer())
+
+
+@intrinsic(prefer_literal=True)
+def registers(typing: Any, count: Any) -> Any:
+    """Return a workspace on the stack, (count, SIMD_WIDTH); the count must be a constant.
+
+    LLVM knows that nothing else refers to it, and keeps rows with constant numbers in registers.
+    """
+    kind = types.Array(types.float64, 2, "C")
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        number = count.literal_value
+        rows = cgutils.alloca_once(builder, ir.ArrayType(_VECTOR, number))
+        array = context.make_array(kind)(context, builder)
+        data, shape = builder.bitcast(rows, array.data.type), (number, SIMD_WIDTH)
+        counts = [ir.Constant(ir.IntType(64), each) for each in (*shape, 8 * SIMD_WIDTH, 8)]
+        populate_array(array, data, counts[:2], counts[2:], 8, None)
+        return array._getvalue()
+
+    return kind(count), code
 
 
 @intrinsic
@@ -90,22 +115,93 @@ def _exp(typing: Any, x: Any) -> Any:
 
 
 @intrinsic
-def _positive_part(typing: Any, x: Any) -> Any:
+def _rint(typing: Any, x: Any) -> Any:
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        nothing = ir.Constant(_VECTOR, [0.0] * SIMD_WIDTH)
-        negative = builder.fcmp_ordered("<", args[0], nothing)
-        return builder.select(negative, nothing, args[0])  # NaN stays
+        return _call(builder, "rint", args)
 
     return SIMD_VECTOR(x), code
 
 
 @intrinsic
-def _step(typing: Any, x: Any) -> Any:
+def _fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        zeros, ones = (ir.Constant(_VECTOR, [value] * SIMD_WIDTH) for value in (0.0, 1.0))
-        return builder.select(builder.fcmp_ordered(">=", args[0], zeros), ones, zeros)
+        return _call(builder, "fma", _vectors(context, builder, signature, args))
+
+    return SIMD_VECTOR(x, y, z), code
+
+
+@intrinsic
+def _exponent(typing: Any, x: Any) -> Any:
+    """Return the exponent of 2 of each lane, a positive number."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        bits = builder.lshr(builder.bitcast(args[0], _INTEGERS), _integers(52))
+        return builder.sitofp(builder.sub(bits, _integers(1023)), _VECTOR)
 
     return SIMD_VECTOR(x), code
+
+
+@intrinsic
+def _power_of_two(typing: Any, x: Any) -> Any:
+    """Return 2^x of each lane, a whole number above -1023 and below 1024."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        whole = builder.add(builder.fptosi(args[0], _INTEGERS), _integers(1023))
+        return builder.bitcast(builder.shl(whole, _integers(52)), _VECTOR)
+
+    return SIMD_VECTOR(x), code
+
+
+@intrinsic
+def choose(typing: Any, x: Any, y: Any, below: Any, other: Any) -> Any:
+    """Return `below` in lanes with x < y, and `other` elsewhere, also where x or y is NaN."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        x, y, below, other = _vectors(context, builder, signature, args)
+        return builder.select(builder.fcmp_ordered("<", x, y), below, other)
+
+    return SIMD_VECTOR(x, y, below, other), code
+
+
+@inlined
+def log1p(x):
+    """Return ln(1 + x) of each lane to rounding; NaN unless x > -1.
+
+    With 1 + x = 2^k (1 + f) it is k ln 2 + 2 artanh(s), s = f / (2 + f), |s| < 0.172.
+    """
+    k = _exponent(math.sqrt(2.0) * (1.0 + x))
+    scale = _power_of_two(0.0 - k)
+    f = _fma(scale, x, scale - 1.0)  # 1 + x is not rounded
+    s = f / (2.0 + f)
+    square = s * s
+    fourth = square * square
+    odd, even = fourth * (1 / 19), fourth * (1 / 21)  # independent sums
+    for n in range(3, 0, -1):
+        odd, even = (odd + 1 / (4 * n + 3)) * fourth, (even + 1 / (4 * n + 5)) * fourth
+    series = square * (odd + 1 / 3) + fourth * (even + 1 / 5)
+    return choose(-1.0, x, k * math.log(2.0) + (2.0 * s + 2.0 * s * series), math.nan)
+
+
+@inlined
+def expm1(x):
+    """Return e^x - 1 of each lane to rounding, for |x| < 700."""
+    n = _rint(x * (1 / math.log(2.0)))
+    r = _fma(n, -2.3190468138462996e-17, _fma(n, -math.log(2.0), x))  # x - n ln 2, |r| < 0.347
+    series = 1.0 + r * (1 / 14)
+    for k in range(13, 1, -1):
+        series = 1.0 + r * (1 / k) * series
+    scale = _power_of_two(n)
+    return _fma(scale, r * series, scale - 1.0)
+
+
+def nonzero(x):
+    """Return True for a vector and for numbers except 0.0; callable in compiled code only."""
+    raise NotImplementedError
+
+
+@overload(nonzero)
+def _overloaded_nonzero(x):
+    return (lambda x: True) if isinstance(x, SIMDVector) else (lambda x: x != 0.0)
 
 
 @overload(arithmetic.exp)
@@ -115,12 +211,12 @@ def _overloaded_exp(x):
 
 @overload(arithmetic.positive_part)
 def _overloaded_positive_part(x):
-    return lambda x: _positive_part(x)
+    return lambda x: choose(x, 0.0, 0.0, x)  # NaN stays
 
 
 @overload(arithmetic.step)
 def _overloaded_step(x):
-    return lambda x: _step(x)
+    return lambda x: choose(x, 0.0, 0.0, 1.0)
 
 
 def _vector(context: Any, builder: Any, value: Any, kind: Any) -> Any:
@@ -134,12 +230,22 @@ def _vector(context: Any, builder: Any, value: Any, kind: Any) -> Any:
     return builder.shuffle_vector(first, nothing, everywhere)
 
 
+def _vectors(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
+    """Return the arguments of an intrinsic as vectors."""
+    pairs = zip(args, signature.args, strict=True)
+    return [_vector(context, builder, value, kind) for value, kind in pairs]
+
+
+def _integers(value: int) -> Any:
+    """Return an integer in every lane."""
+    return ir.Constant(_INTEGERS, [value] * SIMD_WIDTH)
+
+
 def _operator(function: Any, instruction: str) -> None:
     @intrinsic
     def apply(typing: Any, x: Any, y: Any) -> Any:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            pair = zip(args, signature.args, strict=True)
-            vectors = [_vector(context, builder, value, kind) for value, kind in pair]
+            vectors = _vectors(context, builder, signature, args)
             return getattr(builder, instruction)(*vectors, flags=_FLAGS)
 
         return SIMD_VECTOR(x, y), code

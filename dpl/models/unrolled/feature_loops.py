@@ -80,7 +80,7 @@ def unbalanced_stress(law, c, needs, finite, H, linear, work, out):
             for r in range(9):
                 H[r, k] = 0.0
     point.strain(H, finite, e)
-    point.stress(law, c, needs, e, point.volume_change(H), X, S, scratch, D, False)
+    point.stress(law, c, needs, e, point.volume_change(H), X, S, D, False)
     mu, lam = load(c, c.shape[0] - 2), load(c, c.shape[0] - 1)
     trace = load(linear, 0) + load(linear, 4) + load(linear, 8)
     for i in range(3):
