@@ -18,7 +18,7 @@ from dpl.fem.linear.condensation import (
     Condensed,
     condense,
     condensed_block_solve,
-    condensed_solve,
+    condensed_solves,
 )
 from dpl.fem.linear.interface import Array, DirectFactor, full_matrix
 from dpl.fem.parity import Parities, SignedOrbits
@@ -91,8 +91,7 @@ class ParityFactor(DirectFactor):
         parts = characters @ (scales * right[images])
         solved = np.empty_like(parts)
         table, unknowns, _ = self.blocks.fronts
-        for values, part, solution in zip(self.blocks.values, parts, solved, strict=True):
-            condensed_solve(table, unknowns, values, part, solution)
+        condensed_solves(table, unknowns, self.blocks.values, parts, solved)
         x = np.empty_like(right)
         x[images] = signs * (characters.T @ solved)
         return x
