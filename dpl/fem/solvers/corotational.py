@@ -113,7 +113,7 @@ class CorotationalPreconditioner:
 
 
 @dataclass(frozen=True, eq=False)
-class CorotatedFactor:
+class CorotatedFactor(Factor):
     """R K(0)^-1 R^T, symmetric, and positive definite if K(0) is.
 
     Attributes:
@@ -135,7 +135,7 @@ class CorotatedFactor:
         """Return R M R^T right, (n,), M the inverse of K(0) or its preconditioner."""
         return self._from_frames(self.factor.apply(self._to_frames(right)))
 
-    def solve(self, right: Array, rtol: float) -> Array:
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return R K(0)^-1 R^T right, (n,), to a relative residual, see `Factor.solve`."""
         return self._from_frames(self.factor.solve(self._to_frames(right), rtol))
 

@@ -20,7 +20,7 @@ from dpl.fem.linear.condensation import (
     condensed_block_solve,
     condensed_solves,
 )
-from dpl.fem.linear.interface import Array, DirectFactor, full_matrix
+from dpl.fem.linear.interface import Array, Factor, full_matrix
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
 from dpl.fem.symmetry import SymmetryGroup
@@ -58,7 +58,7 @@ class OrbitForm(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ParityFactor(DirectFactor):
+class ParityFactor(Factor):
     """Nested condensation of K(0) for one value of each of m orbits, M parities.
 
     Attributes:
