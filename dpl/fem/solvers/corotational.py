@@ -108,7 +108,8 @@ class CorotationalPreconditioner:
         numbers[:, :dim] = self.problem.pattern.number
         free, each = numbers >= 0, np.broadcast_to(volumes[:, None], cells.shape)
         around = np.bincount(cells.ravel(), each.ravel(), nodes)
-        weights = (free[:, :, None] & free[:, None, :]) / around[:, None, None]
+        turned = free & (free.sum(axis=1, keepdims=True) > 1)
+        weights = (turned[:, :, None] & turned[:, None, :]) / around[:, None, None]
         return gradients, volumes, cells, weights.reshape(nodes, 9), numbers
 
 
@@ -225,8 +226,10 @@ def _rotations(sums, weights, out):
             if largest < POLAR_TOL**2:
                 break
         for lane in range(count):
+            node = start + lane
             for r in range(9):
-                out[start + lane, r] = X[r, lane] if det[0, lane] > 0 else IDENTITY[r]
+                is_free = det[0, lane] > 0 and weights[node, r] > 0
+                out[node, r] = X[r, lane] if is_free else IDENTITY[r]
 
 
 @njit([float64[::1](TENSORS, INDICES, VALUES)], cache=True)
