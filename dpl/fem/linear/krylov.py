@@ -82,7 +82,8 @@ def conjugate_gradients(
 
 def scaled_norm(vector: Array) -> float:
     """Return the Euclidean norm, without overflow or underflow of squares."""
-    size = float(np.linalg.norm(vector))
+    with np.errstate(over="ignore"):
+        size = float(np.linalg.norm(vector))
     if 1e-140 < size < 1e140:
         return size
     largest = float(np.abs(vector).max(initial=0))
