@@ -169,7 +169,7 @@ def _deflection(scene: Scene, force: Tensor) -> float:
 
 
 def _is_stable(scene: Scene, displacement: Tensor) -> bool:
-    return not scene.newton.stability(displacement).negative_pivots
+    return not scene.newton.stability(displacement)
 
 
 def _critical(scene: Scene, force: Tensor) -> float:

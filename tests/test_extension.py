@@ -23,7 +23,7 @@ from scipy.linalg import ldl, solve
 from torch import nn
 
 import dpl.fem as fem
-from dpl.fem.linear import DirectFactor, SingularMatrix, full_matrix
+from dpl.fem.linear import Factor, SingularMatrix, full_matrix
 from dpl.fem.materials.tensors import trace, volume_change
 from dpl.training import Loss
 
@@ -112,7 +112,7 @@ class ModifiedNewton:
 
 
 @dataclass(frozen=True, eq=False)
-class DenseFactor(DirectFactor):
+class DenseFactor(Factor):
     matrix: np.ndarray
 
     @property

@@ -100,7 +100,7 @@ def data_of_large_loads(auditor: Auditor) -> Outcome:
             accepted += 1
             rows.append(Row(f"{kept}: ||R|| / ||f||", "< 1e-8", float(sound.residual)))
             rows.append(Row(f"{kept}: min J", "> 0", float(sound.volume_ratio)))
-            rows.append(Row(f"{kept}: pivots", "0", float(newton.stability(u).negative_pivots), 0))
+            rows.append(Row(f"{kept}: pivots", "0", float(newton.stability(u)), 0))
         else:
             rows.append(Row(f"{kept}: rejected, and why", "1", float(bool(made.reason)), 0))
     return classify(f"{accepted} of 8 accepted, the others rejected with their reason", rows)

@@ -387,9 +387,9 @@ class Simulator:
         """Return a solution with the number of negative eigenvalues of its tangent."""
         if not state.converged or int(state.negative_pivots) >= 0:
             return state
-        stability = self.scene.newton.with_parameters(load.parameters).stability(state.displacement)
-        pivots = stability.negative_pivots
-        status = Status.UNSTABLE if stability.least else Status.CONVERGED
+        newton = self.scene.newton.with_parameters(load.parameters)
+        pivots = newton.stability(state.displacement)
+        status = Status.UNSTABLE if pivots > 0 else Status.CONVERGED
         return state._replace(
             negative_pivots=torch.full_like(state.negative_pivots, pivots),
             status=torch.full_like(state.status, int(status)),

@@ -1,8 +1,5 @@
 """Laws of factor reuse: the same solutions with fewer factorisations."""
 
-import math
-import pickle
-from dataclasses import replace
 from functools import partial
 from itertools import cycle, pairwise
 
@@ -16,10 +13,8 @@ from torch import Tensor
 from benchmarks.stress.fixtures import column, cube
 from dpl import fem
 from dpl.fem.linear import BandedCholesky, Pardiso, SuperLU, multigrid_installed
-from dpl.fem.linear.interface import UNKNOWN, UNSTABLE, Stability
 from dpl.fem.linear.superlu import SuperLUFactor
 from dpl.fem.solvers import factor_reuse as reuse_module
-from dpl.fem.solvers.factor_reuse import Preconditioner, select_preconditioner
 
 NH, SVK = fem.NeoHookeanLn(0.3), fem.SaintVenantKirchhoff(0.3)
 
@@ -351,49 +346,3 @@ def test_straight_column_far_beyond_is_the_same_with_and_without_reuse():
         assert few.status.item() == every.status.item() == fem.Status.UNSTABLE
         assert few.negative_pivots.item() == every.negative_pivots.item()
         check(every, few, fewer=False)
-
-
-# ---- selection
-
-
-@pytest.mark.parametrize(
-    ("last", "near", "definite", "corotational", "expected"),
-    [
-        (None, False, False, False, "FRESH"),
-        (None, False, False, True, "COROTATED"),
-        ("REST", True, True, False, "FRESH"),
-        ("REST", True, True, True, "COROTATED"),
-        ("FRESH", True, True, True, "STALE"),
-        ("STALE", True, True, True, "STALE"),
-        ("FRESH", True, False, True, "FRESH"),
-        ("FRESH", False, True, True, "COROTATED"),
-        ("STALE", False, True, False, "FRESH"),
-        ("COROTATED", True, True, True, "COROTATED"),
-        ("COROTATED", True, True, False, "FRESH"),
-    ],
-)
-def test_preconditioner_follows_from_the_last_one(last, near, definite, corotational, expected):
-    kind = None if last is None else Preconditioner[last]
-    found = select_preconditioner(kind, near=near, definite=definite, corotational=corotational)
-    assert found is Preconditioner[expected]
-
-
-def test_stability_is_encoded_as_in_the_solution():
-    assert UNKNOWN.negative_pivots == -1
-    assert UNSTABLE.negative_pivots == 1
-    assert [Stability(n, exact=True).negative_pivots for n in (0, 1, 3)] == [0, 1, 3]
-
-
-# ---- options
-
-
-@pytest.mark.parametrize("reuse", [-0.1, -1e-300, math.nan, math.inf])
-def test_reuse_out_of_range_is_refused_by_name(beam, reuse):
-    with pytest.raises(ValueError, match=f"factor_reuse_tol = {reuse} must be 0 or more"):
-        fem.Newton(beam(NH, 4, 1), factor_reuse_tol=reuse)
-
-
-def test_reuse_survives_pickling_and_replacing(beam):
-    solver = fem.Newton(beam(NH, 4, 1), factor_reuse_tol=0.25)
-    assert pickle.loads(pickle.dumps(solver)).factor_reuse_tol == 0.25
-    assert replace(solver, mixed_integration=False).factor_reuse_tol == 0.25

@@ -173,10 +173,10 @@ def test_conjugate_gradients_detect_indefinite_matrices(body):
     eigenvalues = np.linalg.eigvalsh(full_matrix(pattern, values).toarray())
     for near_null in (None, motions(body)):
         solver = make_backend(pattern, "cg", near_null)
-        assert solver.factorise(values).stability() == (0, True)
+        assert solver.factorise(values).stability() == 0
         for count in (1, 3):
             moved = shifted(pattern, values, eigenvalues[count - 1] * 1.01)
-            assert solver.factorise(moved).stability() == (1, False)
+            assert solver.factorise(moved).stability() == 1
         with pytest.raises(SingularMatrix, match="not positive definite"):
             solver.factorise(moved).solve(np.ones(pattern.size))
 
@@ -219,17 +219,6 @@ def test_factor_stays_valid_after_the_next_factorisation(name, stiffness):
     assert np.array_equal(first.solve(right), expected)
 
 
-def test_storage_of_an_unused_factor_is_reused(stiffness):
-    pattern, values = stiffness
-    solver = make_backend(pattern, "band")
-    first = solver.factorise(values)
-    second = solver.factorise(values)
-    assert not np.shares_memory(first.storage, second.storage)
-    storage = second.storage
-    del second
-    assert np.shares_memory(solver.factorise(values).storage, storage)
-
-
 def test_a_solve_changes_no_argument_and_takes_strides(name, stiffness):
     pattern, values = stiffness
     many = np.random.default_rng(0).standard_normal((pattern.size, 3))
@@ -248,8 +237,10 @@ def test_matrix_that_is_not_finite_is_an_error(name, stiffness, entry):
     pattern, values = stiffness
     broken = values.copy()
     broken[7] = entry
+    solver = make_backend(pattern, name)
     with pytest.raises(SingularMatrix, match="finite"):
-        make_backend(pattern, name).factorise(broken)
+        solver.factorise(broken)
+    assert error(solver, pattern, values) < 1e-10, "it solves the next one"
 
 
 MATRIX = np.random.default_rng(1).normal(size=(6, 6))
@@ -272,14 +263,6 @@ def test_singular_matrix_is_an_error(name, kind):
 
     with pytest.raises(SingularMatrix):
         attempt()
-
-
-def test_backend_works_after_a_matrix_that_it_refused(name, stiffness):
-    pattern, values = stiffness
-    solver = make_backend(pattern, name)
-    with pytest.raises(SingularMatrix):
-        solver.factorise(np.full_like(values, np.nan))
-    assert error(solver, pattern, values) < 1e-10
 
 
 @pytest.mark.parametrize("used", [False, True])

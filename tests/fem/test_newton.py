@@ -337,6 +337,7 @@ def test_force_that_is_no_number_has_no_answer_even_on_a_held_node(beam, pull, b
         *product(("tol", "intermediate_tol", "min_detF_ratio", "min_load_step"), (0, 1)),
         *(("tol", -1e-8), ("tol", math.nan), ("max_iter", 0), ("max_iter", -3)),
         *(("max_total_iter", 0), ("linear", "umfpack")),
+        *(("factor_reuse_tol", tol) for tol in (-0.1, -1e-300, math.nan, math.inf)),
     ],
 )
 def test_option_out_of_range_is_an_error_that_names_it(beam, name, value):

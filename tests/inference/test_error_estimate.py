@@ -199,7 +199,7 @@ def compressed(scene, part, across):
     for _ in range(12):
         middle = (low + high) / 2
         _, found = solution(middle, 0.0)
-        stable = found.converged and not newton.stability(found.displacement).negative_pivots
+        stable = found.converged and not newton.stability(found.displacement)
         low, high = (middle, high) if stable else (low, middle)
     load, found = solution(part * low, across)
     soft = scene.linear.solve_force(side)[None]

@@ -181,22 +181,11 @@ def test_the_prediction_is_used_exactly_where_its_residual_is_smaller(scene, loa
     ],
 )
 def test_the_pick_rule_is_a_smaller_residual_with_nothing_inverted(ratio_p, ratio_1, volume, used):
-    def state(ratio, volume):
-        zero = torch.zeros(1, dtype=torch.int64)
-        return Solution(
-            displacement=torch.zeros(1, 2, 3),
-            residual=torch.tensor([ratio]),
-            volume_ratio=torch.tensor([volume]),
-            status=torch.tensor([int(Status.NOT_CONVERGED)]),
-            negative_pivots=zero,
-            iterations=zero,
-            factorisations=zero,
-            load_factor=torch.zeros(1),
-            seconds=torch.zeros(1),
-            from_guess=torch.zeros(1, dtype=torch.bool),
-        )
-
-    assert prefer_prediction(state(ratio_p, volume), state(ratio_1, 0.9)) is used
+    predicted, first = (
+        SimpleNamespace(residual=torch.tensor([r]), volume_ratio=torch.tensor([v]))
+        for r, v in ((ratio_p, volume), (ratio_1, 0.9))
+    )
+    assert prefer_prediction(predicted, first) is used
 
 
 def test_a_zero_prediction_is_used_if_its_residual_is_smaller(scene, loads, stubs):

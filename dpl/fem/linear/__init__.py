@@ -9,12 +9,9 @@ if TYPE_CHECKING:
     from dpl.fem.linear.banded import BandedCholesky, MixedPrecisionBandedCholesky
     from dpl.fem.linear.interface import (
         Backend,
-        DirectFactor,
         Factor,
-        IterativeFactor,
         Pattern,
         SingularMatrix,
-        Stability,
         SymmetricProduct,
         full_matrix,
     )

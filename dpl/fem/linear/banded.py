@@ -16,7 +16,6 @@ from scipy.linalg.lapack import dpbtrf, spbtrf
 from dpl.fem.linear.interface import (
     Array,
     Backend,
-    DirectFactor,
     Factor,
     Pattern,
     SingularMatrix,
@@ -139,7 +138,7 @@ def _dense_columns(L: NDArray[Any]) -> NDArray[Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class BandedFactor(DirectFactor):
+class BandedFactor(Factor):
     """Banded Cholesky factor L of a positive definite matrix.
 
     Attributes:
@@ -275,7 +274,7 @@ class MixedPrecisionBandedCholesky(BandedCholesky):
         return MixedPrecisionFactor(self, values.copy(), rough, scale)
 
 
-class MixedPrecisionFactor(DirectFactor):
+class MixedPrecisionFactor(Factor):
     """A matrix with its factor in float32, and one in float64 after a solve that needed it."""
 
     MAX_ITER = 25  # more iterations cost more than a float64 factor

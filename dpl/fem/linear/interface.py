@@ -1,6 +1,7 @@
 """Interface of the linear backends, their exception, products with symmetric matrices."""
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,43 +33,32 @@ class SingularMatrix(ArithmeticError):
     """The matrix has no usable factorisation, or an iterative solve does not converge."""
 
 
-class Stability(NamedTuple):
-    """Number of negative eigenvalues of a symmetric matrix, as far as it is known.
+UNKNOWN = -1  # number of negative eigenvalues that is not known
 
-    Attributes:
-        least: Lower bound of the number.
-        exact: Whether the bound is the number itself.
+
+class Factor(ABC):
+    """A factorised matrix K, or the matrix and its preconditioner in an iterative backend.
+
+    A direct backend implements `solve` and `negative_pivots`, an iterative one `solve` and `apply`.
     """
-
-    least: int
-    exact: bool
-
-    @property
-    def negative_pivots(self) -> int:
-        """The bound as `Solution.negative_pivots` stores it; -1 where nothing is known."""
-        return self.least if self.least or self.exact else -1
-
-
-UNKNOWN = Stability(0, exact=False)
-UNSTABLE = Stability(1, exact=False)  # some eigenvalues are negative or zero, not counted
-
-
-class Factor(Protocol):
-    """A factorised matrix, or the matrix and its preconditioner in an iterative backend."""
 
     @property
     def negative_pivots(self) -> int | None:
         """Number of negative eigenvalues; None where the backend does not count them."""
+        return None
 
-    def stability(self) -> Stability:
-        """Return the known bound of the number of negative eigenvalues.
+    def stability(self) -> int:
+        """Return the number of negative eigenvalues; 1 for any number, `UNKNOWN` for no knowledge.
 
-        Iterative backends need a linear solve for it.
+        Iterative backends may need a linear solve for it.
         """
+        return UNKNOWN if self.negative_pivots is None else self.negative_pivots
 
     def apply(self, right: Array) -> Array:
         """Return an approximation of K^-1 right, (n,), by a fixed symmetric preconditioner."""
+        return self.solve(right)
 
+    @abstractmethod
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right.
 
@@ -83,39 +73,10 @@ class Factor(Protocol):
 
     def solve_many(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return the solutions, (k, n), of right-hand sides (k, n), see `solve`."""
-
-
-class SolvesOneByOne:
-    """Base of factors that solve for several right-hand sides one after the other."""
-
-    def solve_many(self: Factor, right: Array, rtol: float = 1e-12) -> Array:
-        """Return the solutions, (k, n), see `Factor.solve_many`."""
         solutions = np.empty_like(right)
         for row, one in zip(solutions, right, strict=True):
             row[:] = self.solve(one, rtol)
         return solutions
-
-
-class DirectFactor(SolvesOneByOne):
-    """Base of the factors that count negative pivots and whose solves are exact to rounding."""
-
-    def apply(self: Factor, right: Array) -> Array:
-        """Return `solve`."""
-        return self.solve(right)
-
-    def stability(self: Factor) -> Stability:
-        """Return the number of negative pivots."""
-        return Stability(self.negative_pivots or 0, exact=True)
-
-
-class IterativeFactor(SolvesOneByOne):
-    """Base of the factors that count no pivots: the stability of an equilibrium is unknown."""
-
-    negative_pivots: None = None
-
-    def stability(self) -> Stability:
-        """Return `UNKNOWN`."""
-        return UNKNOWN
 
 
 class Backend(Protocol):

@@ -4,22 +4,20 @@ import importlib
 import importlib.util
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
 from dpl.fem.linear.interface import (
     UNKNOWN,
-    UNSTABLE,
     Array,
+    Factor,
     Pattern,
     SingularMatrix,
-    SolvesOneByOne,
-    Stability,
     SymmetricProduct,
     full_matrix,
     require_finite,
@@ -64,63 +62,70 @@ def conjugate_gradients(
     Raises:
         SingularMatrix: K is not positive definite, or `max_iter` is not enough.
     """
-    x = np.zeros_like(right)
     largest = float(np.abs(right).max(initial=0.0))
     if largest == 0:
-        return x
+        return np.zeros_like(right)
     unit = 2.0 ** np.clip(np.frexp(largest)[1], -1021, 1023)  # else squares under- or overflow
-    residual = right / unit
-    initial = np.linalg.norm(residual)
-    target = rtol * initial
-    z = precondition(residual)
-    direction, rz = z.copy(), residual @ z
-    least = rtol**2 * rz if natural else 0.0
-    for k in range(1, max_iter + 1):
-        image = product(direction)
-        curvature = direction @ image
-        if not (curvature > 0 and rz > 0):
+    first = 0.0
+    for k, state in enumerate(krylov_steps(product, precondition, right / unit)):
+        if not state.is_definite:
             raise NotDefinite("the matrix is not positive definite: negative curvature")
-        length = rz / curvature
-        x += length * direction
-        residual -= length * image
-        norm = np.linalg.norm(residual)
-        if norm <= target and not natural:
-            return unit * x
-        if abort_if_slow and k >= 3 and (norm / initial) ** (max_iter / k) > rtol:
+        square = float(state.residual @ (state.preconditioned if natural else state.residual))
+        first = first if k else square
+        if k and square <= rtol**2 * first:
+            return unit * state.solution
+        is_slow = abort_if_slow and k >= 3 and (square / first) ** (max_iter / (2 * k)) > rtol
+        if is_slow or k == max_iter:
             break
-        z = precondition(residual)
-        rz, before = residual @ z, rz
-        if natural and rz <= least:
-            return unit * x
-        direction *= rz / before
-        direction += z
     raise SingularMatrix(f"no convergence to {rtol:g} in {max_iter} conjugate gradient steps")
 
 
 def scaled_norm(vector: Array) -> float:
     """Return the Euclidean norm, without overflow or underflow of squares."""
+    with np.errstate(over="ignore"):
+        size = float(np.linalg.norm(vector))
+    if 1e-140 < size < 1e140:
+        return size
     largest = float(np.abs(vector).max(initial=0))
     if not 0 < largest < math.inf:
         return largest
     return largest * float(np.linalg.norm(vector / largest))
 
 
-class KrylovStep(NamedTuple):
-    """State of conjugate gradients after some steps.
+@dataclass(eq=False)
+class KrylovState:
+    """State of conjugate gradients, valid until the next step.
 
     Attributes:
         solution: x, (n,).
-        preconditioned: M^-1 (right - K x), (n,).
-        ritz: Smallest Ritz value of M^-1 K; infinite before the first step, -inf where K is not
-            positive definite.
+        residual: right - K x, (n,).
+        precondition: As of `conjugate_gradients`.
+        lanczos: Diagonal and off-diagonal of the tridiagonal matrix of the steps.
+        is_definite: False after a direction of negative curvature.
     """
 
     solution: Array
-    preconditioned: Array
-    ritz: float
+    residual: Array
+    precondition: Map
+    lanczos: tuple[list[float], list[float]]
+    is_definite: bool = True
+
+    @cached_property
+    def preconditioned(self) -> Array:
+        """M^-1 (right - K x), (n,)."""
+        return self.precondition(self.residual)
+
+    @property
+    def ritz(self) -> float:
+        """Smallest Ritz value of M^-1 K; infinite without a step, -inf if K is indefinite."""
+        diagonal, off_diagonal = self.lanczos
+        if not (diagonal and self.is_definite):
+            return math.inf if self.is_definite else -math.inf
+        matrix = np.diag(diagonal) + np.diag(off_diagonal, -1)  # the lower triangle is read
+        return float(np.linalg.eigvalsh(matrix)[0])
 
 
-def krylov_steps(product: Map, precondition: Map, right: Array) -> Iterator[KrylovStep]:
+def krylov_steps(product: Map, precondition: Map, right: Array) -> Iterator[KrylovState]:
     """Yield the initial state of conjugate gradients from zero and the state after each step.
 
     The iteration ends after a direction of negative curvature and at the solution.
@@ -132,32 +137,27 @@ def krylov_steps(product: Map, precondition: Map, right: Array) -> Iterator[Kryl
         product, precondition: As of `conjugate_gradients`.
         right: Right-hand side, (n,), of order one.
     """
-    x, residual = np.zeros_like(right), right.copy()
-    z = precondition(residual)
-    direction, rz = z.copy(), float(residual @ z)
     diagonal: list[float] = []
     off_diagonal: list[float] = []
-    carried = 0.0
-    yield KrylovStep(x, z, math.inf)
-    while rz > 0:
+    state = KrylovState(np.zeros_like(right), right, precondition, (diagonal, off_diagonal))
+    yield state
+    direction, rz, carried = state.preconditioned, float(right @ state.preconditioned), 0.0
+    while rz != 0:
         image = product(direction)
         curvature = float(direction @ image)
-        if not curvature > 0:
-            yield KrylovStep(x, z, -math.inf)
+        if not (curvature > 0 and rz > 0):
+            yield replace(state, is_definite=False)
             return
         length = rz / curvature
         diagonal.append(1 / length + carried)
-        tridiagonal = np.diag(diagonal) + np.diag(off_diagonal, -1)  # the lower triangle is read
-        ritz = float(np.linalg.eigvalsh(tridiagonal)[0])
-        x = x + length * direction
-        residual -= length * image
-        z = precondition(residual)
-        yield KrylovStep(x, z, ritz)
-        rz, before = float(residual @ z), rz
+        x, residual = state.solution + length * direction, state.residual - length * image
+        state = replace(state, solution=x, residual=residual)
+        yield state
+        rz, before = float(residual @ state.preconditioned), rz
         ratio = rz / before
         carried = ratio / length
         off_diagonal.append(math.sqrt(max(ratio, 0.0)) / length)
-        direction = z + ratio * direction
+        direction = state.preconditioned + ratio * direction
 
 
 def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int = 8) -> float:
@@ -180,23 +180,21 @@ def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int =
 
 
 @dataclass(frozen=True, eq=False)
-class CGFactor(SolvesOneByOne):
+class CGFactor(Factor):
     """A matrix and its preconditioner.
 
     Attributes:
         product: Function x -> K x.
         precondition: Function r -> M^-1 r, near K^-1 r.
         max_iter: Largest number of iterations of a solve.
-        negative_pivots: None, not counted; see `stability`.
     """
 
     product: SymmetricProduct
     precondition: Map
     max_iter: int
-    negative_pivots: None = None
 
-    def stability(self) -> Stability:
-        """Return stable or unstable, or `UNKNOWN` if the solve does not converge.
+    def stability(self) -> int:
+        """Return 0 or, if there are negative eigenvalues, 1; `UNKNOWN` without convergence.
 
         CG detects negative curvature only in the Krylov space of its right-hand side, so this
         solves with a random one, which has a component along every eigenvector. The residual
@@ -206,15 +204,15 @@ class CGFactor(SolvesOneByOne):
         return self._stability
 
     @cached_property
-    def _stability(self) -> Stability:
+    def _stability(self) -> int:
         noise = np.random.default_rng(0).standard_normal(len(self.product.diagonal))
         try:
             self.solve(noise, DEFINITENESS_TOL)
         except NotDefinite:
-            return UNSTABLE
+            return 1
         except SingularMatrix:
             return UNKNOWN
-        return Stability(0, exact=True)
+        return 0
 
     def apply(self, right: Array) -> Array:
         """Return M^-1 right, (n,)."""

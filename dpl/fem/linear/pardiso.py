@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from dpl.fem.linear.interface import Array, DirectFactor, Pattern, SingularMatrix, require_finite
+from dpl.fem.linear.interface import Array, Factor, Pattern, SingularMatrix, require_finite
 
 
 @dataclass(frozen=True, eq=False)
-class PardisoFactor(DirectFactor):
+class PardisoFactor(Factor):
     """LDL^T factor. MKL stores one at a time; solving with an older one factorises it again."""
 
     parent: "Pardiso"
     matrix: csr_array
-    negative_pivots: int
+    negative_pivots: int = 0
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right."""

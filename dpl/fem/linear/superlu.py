@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 
 from dpl.fem.linear.interface import (
     Array,
-    DirectFactor,
+    Factor,
     Pattern,
     SingularMatrix,
     full_matrix,
@@ -20,7 +20,7 @@ from dpl.fem.linear.interface import (
 
 
 @dataclass(frozen=True, eq=False)
-class SuperLUFactor(DirectFactor):
+class SuperLUFactor(Factor):
     """LDL^T-like factor in a fill-reducing order."""
 
     lu: Any

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from dpl.fem.linear.interface import Array
+from dpl.fem.linear.krylov import scaled_norm
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, evaluate_solution, run_lockstep
+from dpl.fem.solvers.solution import Load, Solution, Status, evaluate_solution, run_lockstep
 
 WINDOW = 5  # iterations in which the residual has to halve
 
@@ -60,38 +61,50 @@ class AndersonSolver:
         yield from run_lockstep([self._member(single, u) for single, u in pairs])
 
     def _member(self, load: Load, guess: Tensor) -> Iterator[Solution]:
-        start = time.perf_counter()
-        newton = self.newton.with_parameters(load.parameters)
-        problem, count = newton.problem, 0
+        """Yield the states under one load."""
+        start, newton = time.perf_counter(), self.newton.with_parameters(load.parameters)
+        problem = newton.problem
         u = torch.where(problem.free, guess, problem.prescribed)
-        state, right = self._state(load, u, count, start)
+        evaluation = problem.evaluate(u)
+        state = evaluate_solution(
+            problem, u, load, self.tol,
+            seconds=time.perf_counter() - start, from_guess=True, evaluation=evaluation,
+        )  # fmt: skip
         yield state
         if state.converged or not state.volume_ratio > 0:
             return
         factor = newton.linear_solver.corotational.at(u)
+        right = problem.restrict(load.force[0] - evaluation.internal[0])
         residuals = [float(state.residual)]
+        size = scaled_norm(right) / residuals[0]  # of the loads
         history = _History(self.memory, len(right))
-        while count < self.max_iter:
+        for count in range(1, self.max_iter + 1):
             step = history.step(right, factor)
-            u, count, before = u + problem.extend(step)[None], count + 1, right
-            state, right = self._state(load, u, count, start)
-            yield state
-            residuals.append(float(state.residual))
-            diverges = not state.volume_ratio > 0 or not residuals[-1] < 10 * residuals[0]
+            u = u + problem.extend(step)[None]
+            evaluation, before = problem.evaluate(u), right
+            right = problem.restrict(load.force[0] - evaluation.internal[0])
+            if problem.moved_supports:  # the reactions are loads too
+                residual = float(problem.relative_residual_of(evaluation.internal, load.force))
+            else:
+                residual = scaled_norm(right) / size
+            residuals.append(residual)
+            is_valid = float(evaluation.volume_ratio) > 0
+            balanced = is_valid and residual < self.tol
+            status = Status.CONVERGED if balanced else Status.NOT_CONVERGED
+            yield state._replace(
+                displacement=u,
+                residual=torch.tensor([residual], dtype=torch.float64),
+                volume_ratio=evaluation.volume_ratio,
+                status=torch.tensor([int(status)]),
+                iterations=torch.tensor([count]),
+                load_factor=torch.tensor([float(balanced)], dtype=torch.float64),
+                seconds=torch.tensor([time.perf_counter() - start], dtype=torch.float64),
+            )
+            diverges = not is_valid or not residual < 10 * residuals[0]
             slow = count >= WINDOW and not min(residuals[-WINDOW:]) < 0.5 * residuals[-WINDOW - 1]
-            if state.converged or diverges or slow:
+            if balanced or diverges or slow:
                 return
             history.add(step, right - before)
-
-    def _state(self, load: Load, u: Tensor, count: int, start: float) -> tuple[Solution, Array]:
-        """Return a displacement as a solution, and the residual force f - f_int(u), (n,)."""
-        evaluation = self.problem.with_parameters(load.parameters).evaluate(u)
-        state = evaluate_solution(
-            self.problem, u, load, self.tol,
-            iterations=count, seconds=time.perf_counter() - start, from_guess=True,
-            evaluation=evaluation,
-        )  # fmt: skip
-        return state, self.problem.restrict((load.force - evaluation.internal)[0])
 
 
 class _History:

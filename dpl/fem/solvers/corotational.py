@@ -12,21 +12,21 @@ import numpy as np
 from numba import float64, int64, njit, void
 from numba.types import Array as Typed
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array
 from torch import Tensor
 
+from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
 from dpl.fem.linear.interface import Array, Factor, SingularMatrix, SymmetricProduct
 from dpl.fem.linear.krylov import conjugate_gradients, smallest_ritz_value
 from dpl.fem.problem import Problem
 
 MAX_POLAR_ITER = 20  # of a polar decomposition; near a rotation it takes three iterations
 POLAR_TOL = 1e-5  # change of an iteration below which the error is below rounding (its square)
+IDENTITY = np.eye(3).ravel()
 
-FIELD = Typed(float64, 2, "A", readonly=True)  # (N, D)
-TENSORS = Typed(float64, 3, "A", readonly=True)  # (N, D, D)
-VALUES = Typed(float64, 1, "A", readonly=True)
-INDICES = Typed(int64, 2, "A", readonly=True)
-OUT = Typed(float64, 3, "A")
+VALUES = Typed(float64, 1, "C", readonly=True)
+TABLE = Typed(float64, 2, "C", readonly=True)
+TENSORS = Typed(float64, 3, "A", readonly=True)
+INDICES = Typed(int64, 2, "C", readonly=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +48,17 @@ class CorotationalPreconditioner:
         """Return the factor of K(0), rotated as the body is at a displacement (1, N, D) [-].
 
         A node has the rotation of its mean deformation gradient. A node fixed in one direction is
-        rotated about that direction only, a node fixed in two is not rotated.
+        rotated about that direction only, a node fixed in two is not rotated. In 2D the rotations
+        are those about the third axis.
         """
-        gradients, volumes, cells = self._cell_means
-        rotations = np.zeros((*self.problem.shape, self.problem.shape[1]))
-        _sum_gradients(displacement[0].numpy(), cells, gradients, volumes, rotations)
-        _to_rotations(rotations, self.problem.pattern.number)
-        kept, indices, indptr = self._structure
-        R = csr_array((rotations[kept], indices, indptr), shape=(self.problem.pattern.size,) * 2)
-        return CorotatedFactor(self.factor, rotations, R)
+        gradients, volumes, cells, weights, numbers = self._arrays
+        u = np.zeros((len(numbers), 3))
+        u[:, : displacement.shape[2]] = displacement[0].numpy()
+        sums = np.zeros((len(u), 9))
+        _sum_gradients(u, cells, gradients, volumes, sums)
+        rotations = np.empty((len(u), 3, 3))
+        _rotations(sums, weights, rotations.reshape(-1, 9))
+        return CorotatedFactor(self.factor, rotations, numbers)
 
     def count_iterations(
         self, displacement: Tensor, *, rtol: float = 1e-3, max_iter: int = 50
@@ -88,36 +90,42 @@ class CorotationalPreconditioner:
         return SymmetricProduct(self.problem.pattern, values)
 
     @cached_property
-    def _cell_means(self) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Mean gradients of the shape functions (E or 1, A, D), volumes (E or 1,), cells."""
-        dN, dV = self.problem.dN.numpy(), self.problem.dV.numpy()
-        volumes = dV.sum(axis=1)
-        gradients = np.einsum("eqaj,eq->eaj", dN, dV) / volumes[:, None, None]
-        # a copy: sending the problem to a process moves the memory of its tensors
-        return gradients, volumes, self.problem.cells.numpy().copy(order="C")
+    def _arrays(self) -> tuple[Array, Array, NDArray[np.int64], Array, NDArray[np.int64]]:
+        """Arrays of the loops over cells and nodes, in 2D with zeros in the third direction.
 
-    @cached_property
-    def _structure(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-        """Mask of the entries of R at free degrees of freedom, their columns and rows in CSR."""
-        free, number = self.problem.free.numpy(), self.problem.pattern.number
-        kept = free[:, :, None] & free[:, None, :]
-        columns = np.broadcast_to(number[:, None, :], kept.shape)[kept]
-        return kept, columns, np.concatenate([[0], kept.sum(axis=2)[free].cumsum()])
+        They are the mean gradients of the shape functions (E or 1, A, 3), volumes (E or 1,) and
+        nodes (E, A) of the cells; for each node one over the volume of its cells where row and
+        column of its gradient are free, else 0, (N, 9), and the numbers of its free degrees of
+        freedom, else -1, (N, 3).
+        """
+        dN, dV = self.problem.dN.numpy(), self.problem.dV.numpy()
+        # a copy: sending the problem to a process moves the memory of its tensors
+        cells = self.problem.cells.numpy().copy(order="C")
+        (nodes, dim), volumes = self.problem.shape, dV.sum(axis=1)
+        gradients = np.zeros((len(dN), dN.shape[2], 3))
+        gradients[..., :dim] = np.einsum("eqaj,eq->eaj", dN, dV) / volumes[:, None, None]
+        numbers = np.full((nodes, 3), -1)
+        numbers[:, :dim] = self.problem.pattern.number
+        free, each = numbers >= 0, np.broadcast_to(volumes[:, None], cells.shape)
+        around = np.bincount(cells.ravel(), each.ravel(), nodes)
+        turned = free & (free.sum(axis=1, keepdims=True) > 1)
+        weights = (turned[:, :, None] & turned[:, None, :]) / around[:, None, None]
+        return gradients, volumes, cells, weights.reshape(nodes, 9), numbers
 
 
 @dataclass(frozen=True, eq=False)
-class CorotatedFactor:
+class CorotatedFactor(Factor):
     """R K(0)^-1 R^T, symmetric, and positive definite if K(0) is.
 
     Attributes:
         factor: Factor of K(0).
-        rotations: Rotations R of the nodes, (N, D, D).
-        matrix: R at free degrees of freedom, (n, n).
+        rotations: Rotations R of the nodes, (N, 3, 3).
+        numbers: Numbers of the free degrees of freedom, else -1, (N, 3).
     """
 
     factor: Factor
     rotations: Array
-    matrix: csr_array
+    numbers: NDArray[np.int64]
 
     @property
     def negative_pivots(self) -> int | None:
@@ -126,111 +134,115 @@ class CorotatedFactor:
 
     def apply(self, right: Array) -> Array:
         """Return R M R^T right, (n,), M the inverse of K(0) or its preconditioner."""
-        return self.matrix @ self.factor.apply(self._transposed @ right)
+        return self._from_frames(self.factor.apply(self._to_frames(right)))
 
-    def solve(self, right: Array, rtol: float) -> Array:
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return R K(0)^-1 R^T right, (n,), to a relative residual, see `Factor.solve`."""
-        return self.matrix @ self.factor.solve(self._transposed @ right, rtol)
+        return self._from_frames(self.factor.solve(self._to_frames(right), rtol))
 
-    @cached_property
-    def _transposed(self) -> csc_array:
-        """R^T at free degrees of freedom, (n, n)."""
-        return self.matrix.T
+    def _to_frames(self, x: Array) -> Array:
+        """Return R^T x, (n,)."""
+        return _rotated(self.rotations.mT, self.numbers, x)
+
+    def _from_frames(self, x: Array) -> Array:
+        """Return R x, (n,)."""
+        return _rotated(self.rotations, self.numbers, x)
 
 
 # One explicit signature each: numba's cache can mix up the machine code of several signatures of a
 # function when two processes save them at the same time.
-@njit([void(FIELD, INDICES, TENSORS, VALUES, OUT)], cache=True)
-def _sum_gradients(u, cells, gradients, volumes, F):
-    """Set F (N, D, D) to the sum of volume times mean gradient over the cells of each node."""
-    dim = u.shape[1]
-    mean = np.empty((dim, dim))
-    for e in range(cells.shape[0]):
-        own = e if gradients.shape[0] > 1 else 0
-        for i in range(dim):
-            for j in range(dim):
-                mean[i, j] = 1.0 if i == j else 0.0
-                for a in range(cells.shape[1]):
-                    mean[i, j] += u[cells[e, a], i] * gradients[own, a, j]
+@njit([void(TABLE, INDICES, TENSORS, VALUES, float64[:, ::1])], cache=True)
+def _sum_gradients(u, cells, gradients, volumes, out):
+    """Add volume times mean gradient of u (N, 3) in the cells of each node to `out` (N, 9)."""
+    mean = np.empty(9)
+    for e in range(len(cells)):
+        own = e if len(gradients) > 1 else 0
+        for i in range(3):
+            p, q, r = 0.0, 0.0, 0.0
+            for a in range(cells.shape[1]):
+                value = u[cells[e, a], i]
+                p += value * gradients[own, a, 0]
+                q += value * gradients[own, a, 1]
+                r += value * gradients[own, a, 2]
+            mean[3 * i : 3 * i + 3] = volumes[own] * p, volumes[own] * q, volumes[own] * r
         for a in range(cells.shape[1]):
-            for i in range(dim):
-                for j in range(dim):
-                    F[cells[e, a], i, j] += volumes[own] * mean[i, j]
+            node = cells[e, a]
+            for k in range(9):
+                out[node, k] += mean[k]
 
 
 @njit
-def _plane(X, a, b, R):
-    """Set rows and columns a and b of R to the rotation of that block of X if its det > 0."""
-    cosine, sine = X[a, a] + X[b, b], X[b, a] - X[a, b]
-    size = np.sqrt(cosine**2 + sine**2)
-    if X[a, a] * X[b, b] - X[a, b] * X[b, a] > 0 and size > 0:
-        R[a, a], R[b, b] = cosine / size, cosine / size
-        R[b, a], R[a, b] = sine / size, -sine / size
-
-
-@njit
-def _cofactors(X, out):
-    """Set `out` to the cofactors of X (3, 3); return its determinant."""
+def set_cofactors(X, out):
+    """Set `out` (9, width) to the cofactors of X (9, width); return det X."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         for c in range(3):
             d, e = (c + 1) % 3, (c + 2) % 3
-            out[i, c] = X[j, d] * X[k, e] - X[j, e] * X[k, d]
-    return X[0, 0] * out[0, 0] + X[0, 1] * out[0, 1] + X[0, 2] * out[0, 2]
+            minor = load(X, 3 * j + d) * load(X, 3 * k + e) - load(X, 3 * j + e) * load(
+                X, 3 * k + d
+            )
+            store(out, 3 * i + c, minor)
+    return load(X, 0) * load(out, 0) + load(X, 1) * load(out, 1) + load(X, 2) * load(out, 2)
 
 
 @njit
-def _polar(X, R):
-    """Set R to the rotation of X (3, 3) if det X > 0; overwrite X.
+def polar_step(X, minors):
+    """Make an iteration X <- (X + X^-T) / 2 towards the rotation of X (9, width), det X > 0.
 
-    Source: Higham (1986), SIAM J. Sci. Stat. Comput. 7: X <- (s X + X^-T / s) / 2.
+    Return the sum of the squares of its change; `minors` (9, width) is overwritten.
+
+    Source: Higham (1986), SIAM J. Sci. Stat. Comput. 7.
     """
-    inverse = np.empty((3, 3))  # transposed
-    change = 1.0
-    for _ in range(MAX_POLAR_ITER):
-        if change < POLAR_TOL:
-            break
-        det = _cofactors(X, inverse)
-        if not det > 0:
-            return
-        size, other = 0.0, 0.0
-        for i in range(3):
-            for j in range(3):
-                inverse[i, j] /= det
-                size += X[i, j] ** 2
-                other += inverse[i, j] ** 2
-        scale = np.sqrt(np.sqrt(other / size))
-        change = 0.0
-        for i in range(3):
-            for j in range(3):
-                new = 0.5 * (scale * X[i, j] + inverse[i, j] / scale)
-                change = max(change, abs(new - X[i, j]))
-                X[i, j] = new
-    R[:] = X
+    half = 0.5 / set_cofactors(X, minors)
+    squares = 0.0 * half
+    for r in range(9):
+        change = half * load(minors, r) - 0.5 * load(X, r)
+        squares = squares + change * change
+        store(X, r, load(X, r) + change)
+    return squares
 
 
-@njit([void(OUT, INDICES)], cache=True)
-def _to_rotations(F, dofs):
-    """Replace each gradient (N, D, D), known up to a positive factor, by its rotation.
+@njit([void(TABLE, TABLE, float64[:, ::1])], cache=True)
+def _rotations(sums, weights, out):
+    """Set `out` (N, 9) to the rotations of the gradients I + weights * sums, (N, 9) each.
 
-    A node with two free components gets the rotation in their plane, one with fewer the identity.
+    The rotation of a gradient with det <= 0 is the identity.
     """
-    dim = F.shape[1]
-    R = np.empty((dim, dim))
-    for n in range(F.shape[0]):
-        count, last = 0, -1
-        for i in range(dim):
-            if dofs[n, i] >= 0:
-                count += 1
-            else:
-                last = i
-        for i in range(dim):
-            for j in range(dim):
-                R[i, j] = 1.0 if i == j else 0.0
-        if count == 2:
-            a = 0 if last != 0 else 1
-            b = 3 - a - last if dim == 3 else 1
-            _plane(F[n], a, b, R)
-        elif count == 3:
-            _polar(F[n], R)
-        F[n] = R
+    X, minors = np.empty((9, SIMD_WIDTH)), np.empty((9, SIMD_WIDTH))
+    det, squares = np.empty((1, SIMD_WIDTH)), np.empty((1, SIMD_WIDTH))
+    for start in range(0, len(sums), SIMD_WIDTH):
+        count = min(SIMD_WIDTH, len(sums) - start)
+        for lane in range(SIMD_WIDTH):
+            node = start + min(lane, count - 1)
+            for r in range(9):
+                X[r, lane] = IDENTITY[r] + weights[node, r] * sums[node, r]
+        store(det, 0, set_cofactors(X, minors))
+        for _ in range(MAX_POLAR_ITER):
+            store(squares, 0, polar_step(X, minors))
+            largest = 0.0
+            for lane in range(count):
+                if det[0, lane] > 0:
+                    largest = max(largest, squares[0, lane])
+            if largest < POLAR_TOL**2:
+                break
+        for lane in range(count):
+            node = start + lane
+            for r in range(9):
+                is_free = det[0, lane] > 0 and weights[node, r] > 0
+                out[node, r] = X[r, lane] if is_free else IDENTITY[r]
+
+
+@njit([float64[::1](TENSORS, INDICES, VALUES)], cache=True)
+def _rotated(R, numbers, x):
+    """Return the products of R (N, 3, 3) with the vectors of the nodes, (n,), zero where fixed."""
+    out = np.empty_like(x)
+    for n in range(len(numbers)):
+        i, j, k = numbers[n, 0], numbers[n, 1], numbers[n, 2]
+        a, b, c = x[i] if i >= 0 else 0.0, x[j] if j >= 0 else 0.0, x[k] if k >= 0 else 0.0
+        if i >= 0:
+            out[i] = R[n, 0, 0] * a + R[n, 0, 1] * b + R[n, 0, 2] * c
+        if j >= 0:
+            out[j] = R[n, 1, 0] * a + R[n, 1, 1] * b + R[n, 1, 2] * c
+        if k >= 0:
+            out[k] = R[n, 2, 0] * a + R[n, 2, 1] * b + R[n, 2, 2] * c
+    return out

@@ -93,24 +93,26 @@ def estimate_error(
     unit = 2.0 ** np.clip(np.frexp(largest)[1], -1021, 1023)
     steps = krylov_steps(product, lambda part: inverse.solve(part, RTOL), right / unit)
     first = 0.0
-    for k, (x, z, ritz) in enumerate(steps):
-        correction = problem.extend(unit * (x if k else z))[None]
-        first = first if k else scaled_norm(z)
+    for k, step in enumerate(steps):
+        made = step.solution if k else step.preconditioned
+        correction = problem.extend(unit * made)[None]
+        first = first if k else scaled_norm(step.preconditioned)
+        ritz = step.ritz
         if not ritz > 0:
             is_near = bool(problem.relative_residual_of(internal, load.force) < NEAR)
             error = math.inf if is_near else DOUBT * float(unit * first) / size
             return ErrorEstimate(error, correction, is_indefinite=is_near)
-        least, made = min(ritz, 1.0), scaled_norm(x)
-        rest = scaled_norm(z) / least
-        if size == 0 or k == products or rest <= REST * made:
+        least, length = min(ritz, 1.0), scaled_norm(step.solution)
+        rest = scaled_norm(step.preconditioned) / least
+        if size == 0 or k == products or rest <= REST * length:
             break
-    if k and float(unit * (made + rest)) > LINEAR * size:
+    if k and float(unit * (length + rest)) > LINEAR * size:
         better = problem.evaluate(displacement + correction)
         left = problem.restrict((load.force - better.internal)[0]) / unit
         if not bool(better.volume_ratio > 0):
             return ErrorEstimate(math.inf, correction)
         rest = max(rest, scaled_norm(inverse.solve(left, RTOL)) / least)
-    distance = (2 - least) * (made + rest)
+    distance = (2 - least) * (length + rest)
     if size == 0:
         return ErrorEstimate(math.inf if distance else 0.0, correction)
     return ErrorEstimate(float(unit * distance) / size, correction)

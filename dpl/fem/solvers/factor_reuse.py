@@ -1,26 +1,22 @@
 """Selection and reuse of the factors that precondition the tangents of one load."""
 
 from contextlib import suppress
-from enum import Enum
 
 from torch import Tensor
 
 from dpl.fem.linear.interface import (
     UNKNOWN,
-    UNSTABLE,
     Array,
     Backend,
     DefiniteBackend,
     Factor,
     Pattern,
     SingularMatrix,
-    Stability,
     SymmetricProduct,
 )
 from dpl.fem.linear.krylov import conjugate_gradients, smallest_ritz_value
 from dpl.fem.linear.unsymmetric import solve_unsymmetric
 from dpl.fem.problem import Problem
-from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.linear import LinearSolver
 
 MIN_RITZ_VALUE = 0.05  # smallest eigenvalue of M^-1 K below which the tangent K is factorised
@@ -28,35 +24,11 @@ MAX_CG_STALE = 8  # conjugate gradient steps with a stale factor before the tang
 MAX_CG_COROTATED = 16  # the same with the corotated factor of K(0)
 
 
-class Preconditioner(Enum):
-    """Matrix whose factor preconditions the solve with a tangent K(u)."""
-
-    REST = "K(0), where u = 0"
-    COROTATED = "K(0), rotated node by node"
-    STALE = "tangent of an earlier iterate"
-    FRESH = "K(u)"
-
-
-def select_preconditioner(
-    last: Preconditioner | None, *, near: bool, definite: bool, corotational: bool
-) -> Preconditioner:
-    """Return the preconditioner of the next solve with a tangent K(u), u other than 0.
-
-    Args:
-        last: Preconditioner of the last solve; None if there was none.
-        near: Whether u is near enough to the last iterate to reuse its factor.
-        definite: Whether the last factor has no negative pivots.
-        corotational: Whether the corotated factor of K(0) may be used.
-    """
-    if near and last in (Preconditioner.STALE, Preconditioner.FRESH):
-        return Preconditioner.STALE if definite else Preconditioner.FRESH
-    return Preconditioner.COROTATED if corotational else Preconditioner.FRESH
-
-
 class TangentSolver:
     """Solver of K(u) x = r for the successive tangents of one load.
 
     A factor preconditions conjugate gradients on later tangents until these need too many steps.
+    It is the factor of an earlier tangent near u, or else that of K(0), rotated node by node.
 
     Attributes:
         factorisations: Tangents factorised so far, without K(0).
@@ -67,8 +39,9 @@ class TangentSolver:
         self.linear_solver, self.backend = linear_solver, linear_solver.tangent_backend
         self.factorisations = 0
         self._corotational = corotational
-        self._last: Preconditioner | None = None
-        self._factor: Factor | CorotatedFactor | None = None
+        self._factor: Factor | None = None  # of the last solve
+        self._rest: Factor | None = None  # that of K(0), once used
+        self._corotated: Factor | None = None  # the same rotated, once used
         self._tangent: SymmetricProduct | None = None  # last one, if it was not factorised
 
     @property
@@ -102,20 +75,14 @@ class TangentSolver:
             SingularMatrix: The tangent has no factor, or is indefinite and refused.
         """
         if tangent is None:
-            self._last, self._factor = Preconditioner.REST, None
-            return self.linear_solver.factor.solve(right, rtol)
-        kind = select_preconditioner(
-            self._last,
-            near=near,
-            definite=self._factor is not None and not self._factor.negative_pivots,
-            corotational=self._corotational and not self.linear_solver.factor.negative_pivots,
-        )
-        corotated = kind is Preconditioner.COROTATED
-        if corotated and not (near and self._last is kind):
-            self._factor = self.linear_solver.corotational.at(u)
-        if kind is not Preconditioner.FRESH and self._factor is not None:
-            self._last, self._tangent = kind, SymmetricProduct(self._pattern, tangent)
-            apply, steps = self._factor.apply, MAX_CG_COROTATED if corotated else MAX_CG_STALE
+            self._rest = self._factor = self.linear_solver.factor
+            self._tangent = None
+            return self._factor.solve(right, rtol)
+        factor = self._preconditioner(u, near=near)
+        if factor is not None:
+            self._factor, self._tangent = factor, SymmetricProduct(self._pattern, tangent)
+            corotated, apply = factor is self._corotated, factor.apply
+            steps = MAX_CG_COROTATED if corotated else MAX_CG_STALE
             with suppress(SingularMatrix):
                 if skew is not None:
                     values = tangent, skew
@@ -124,8 +91,8 @@ class TangentSolver:
                     self._tangent, apply, right, rtol, steps, abort_if_slow=corotated
                 )
             self._corotational &= not corotated
-            del apply  # it refers to the factor, whose storage the next one takes
-        self._last, self._factor, self._tangent = Preconditioner.FRESH, None, None
+            del apply, factor  # the next factor takes the storage of this one
+        self._factor, self._tangent = None, None
         self.factorisations += 1
         if definite and isinstance(self.backend, DefiniteBackend):
             self._factor = self.backend.factorise_definite(tangent)
@@ -138,24 +105,35 @@ class TangentSolver:
             return solve_unsymmetric(self._pattern, tangent, skew, apply, right, rtol)
         return self._factor.solve(right, rtol)
 
-    def stability(self, u: Tensor) -> Stability:
-        """Return the stability of the equilibrium (1, N, D) that the last solve led to.
+    def _preconditioner(self, u: Tensor, *, near: bool) -> Factor | None:
+        """Return the factor for conjugate gradients on K(u); None: K(u) is factorised."""
+        last = self._factor if near and self._factor is not self._rest else None
+        if last is not None and last is not self._corotated:
+            return None if last.negative_pivots else last
+        if not self._corotational or self.linear_solver.factor.negative_pivots:
+            return None
+        if last is None:
+            self._corotated = self.linear_solver.corotational.at(u)
+        return self._corotated
+
+    def stability(self, u: Tensor) -> int:
+        """Return the stability of the equilibrium (1, N, D) of the last solve, see `stability_at`.
 
         The tangent there is factorised only if the last factor has negative pivots or its backend
         does not count them, or if a Ritz value shows an eigenvalue far below the stale factor's.
         """
-        if self._last is Preconditioner.REST:
-            known = self.linear_solver.factor.stability()
-            suspect = known.least > 0
-        elif self._factor is None or self._last is Preconditioner.COROTATED:
+        if self._factor is None or self._factor is self._corotated:
             return UNKNOWN
+        if self._factor is self._rest:
+            known = self._factor.stability()
+            suspect = known > 0
         else:
-            known = Stability(0, exact=True)
+            known = 0
             suspect = self._factor.negative_pivots != 0 or self._ritz_value_is_small()
         if not suspect:
             return known
         self.factorisations += 1
-        self._last, self._factor = None, None
+        self._factor = None
         return stability_at(self.linear_solver.problem, self.backend, u)
 
     def _ritz_value_is_small(self) -> bool:
@@ -168,18 +146,19 @@ class TangentSolver:
         return False
 
 
-def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> Stability:
-    """Return the stability of the tangent at (1, N, D); a singular one counts as unstable.
+def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> int:
+    """Return the number of negative eigenvalues of a tangent, see `Factor.stability`.
 
-    Under a follower load without potential a positive definite symmetric part is sufficient for
-    stability. It is not necessary: otherwise nothing is known.
+    The tangent is that at a displacement (1, N, D). A singular one counts as unstable. Under a
+    follower load without potential a positive definite symmetric part is sufficient for stability.
+    It is not necessary: otherwise nothing is known.
     """
     tangent = problem.linearise(displacement).tangent
     try:
         found = backend.factorise(tangent[0].numpy()).stability()
     except SingularMatrix:  # at the critical load itself
-        found = UNSTABLE
-    return found if problem.has_potential or not found.least else UNKNOWN
+        found = 1
+    return found if problem.has_potential or found <= 0 else UNKNOWN
 
 
 def forcing_term(residual: float, previous: float, *, tol: float, corotational: bool) -> float:

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from dpl.fem.linear.backends import BackendFactory, select_backend
-from dpl.fem.linear.interface import UNKNOWN, SingularMatrix, Stability
+from dpl.fem.linear.interface import UNKNOWN, SingularMatrix
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.factor_reuse import TangentSolver, forcing_term, stability_at
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.load_stepping import LoadStepping, longest_valid_step
-from dpl.fem.solvers.solution import Load, Solution, Status, check_force, check_steps, run_lockstep
+from dpl.fem.solvers.solution import Load, Solution, Status, check_force, check_tol, run_lockstep
 
 FULL_TOL_STEP = 2.0**-4  # load step below which intermediate states are solved to `tol` [-]
 
@@ -81,7 +81,15 @@ class Newton:
     linear_solver: LinearSolver = field(default=None, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        check_steps(self, parts=("intermediate_tol", "min_detF_ratio", "min_load_step"))
+        check_tol(self.tol)
+        for name in ("intermediate_tol", "min_detF_ratio", "min_load_step"):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
+        if not 0 <= self.factor_reuse_tol < math.inf:
+            raise ValueError(f"factor_reuse_tol = {self.factor_reuse_tol} must be 0 or more")
+        for name in ("max_iter", "max_total_iter"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} = {getattr(self, name)} must be 1 or more")
         select_backend(self.linear)
         given = self.linear_solver
         if given is None or given.problem is not self.problem or given.linear != self.linear:
@@ -119,8 +127,8 @@ class Newton:
             return self
         return replace(self, problem=linear.problem, linear_solver=linear)
 
-    def stability(self, displacement: Tensor) -> Stability:
-        """Return the stability of the tangent at (1, N, D); a singular one counts as unstable."""
+    def stability(self, displacement: Tensor) -> int:
+        """Return the negative eigenvalues of the tangent at (1, N, D), see `Factor.stability`."""
         return stability_at(self.problem, self.linear_solver.tangent_backend, displacement)
 
     def _apply_load(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
@@ -265,7 +273,7 @@ class Newton:
         self, state: "_State", force: Tensor, run: "_Run", end: Status | None = None
     ) -> Solution:
         """Return a state as a solution, with status `end` if given."""
-        residual, stability = self._residual(state, force, 1.0), UNKNOWN
+        residual, pivots = self._residual(state, force, 1.0), UNKNOWN
         balanced = end is None and self._is_balanced(state, force, 1.0, self.tol)
         if balanced:
             if residual >= self.tol:
@@ -274,15 +282,15 @@ class Newton:
                     "on this body (very thin cells, moduli far apart?)",
                     stacklevel=2,
                 )
-            stability = run.tangents.stability(state.displacement)
-            end = Status.UNSTABLE if stability.least else Status.CONVERGED
+            pivots = run.tangents.stability(state.displacement)
+            end = Status.UNSTABLE if pivots > 0 else Status.CONVERGED
         factor = 1.0 if balanced else run.steps.factor
         return Solution(
             displacement=state.displacement,
             residual=torch.tensor([residual], dtype=force.dtype),
             volume_ratio=state.volume_ratio,
             status=torch.tensor([int(Status.NOT_CONVERGED if end is None else end)]),
-            negative_pivots=torch.tensor([stability.negative_pivots]),
+            negative_pivots=torch.tensor([pivots]),
             iterations=torch.tensor([run.iterations]),
             factorisations=torch.tensor([run.tangents.factorisations]),
             load_factor=torch.tensor([factor], dtype=force.dtype),

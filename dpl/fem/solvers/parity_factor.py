@@ -18,9 +18,9 @@ from dpl.fem.linear.condensation import (
     Condensed,
     condense,
     condensed_block_solve,
-    condensed_solve,
+    condensed_solves,
 )
-from dpl.fem.linear.interface import Array, DirectFactor, full_matrix
+from dpl.fem.linear.interface import Array, Factor, full_matrix
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
 from dpl.fem.symmetry import SymmetryGroup
@@ -58,7 +58,7 @@ class OrbitForm(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ParityFactor(DirectFactor):
+class ParityFactor(Factor):
     """Nested condensation of K(0) for one value of each of m orbits, M parities.
 
     Attributes:
@@ -91,8 +91,7 @@ class ParityFactor(DirectFactor):
         parts = characters @ (scales * right[images])
         solved = np.empty_like(parts)
         table, unknowns, _ = self.blocks.fronts
-        for values, part, solution in zip(self.blocks.values, parts, solved, strict=True):
-            condensed_solve(table, unknowns, values, part, solution)
+        condensed_solves(table, unknowns, self.blocks.values, parts, solved)
         x = np.empty_like(right)
         x[images] = signs * (characters.T @ solved)
         return x

@@ -1,9 +1,8 @@
 """Interface of all solvers: Load, Solution, Status and Solver."""
 
-import math
 from collections.abc import Iterator, Sequence
 from enum import IntEnum
-from typing import Any, NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -128,24 +127,6 @@ def check_tol(tol: float) -> None:
     """Raise a ValueError unless a tolerance is at least `LEAST_TOL` and below 1."""
     if not LEAST_TOL <= tol < 1:
         raise ValueError(f"tol = {tol} must be at least {LEAST_TOL:g} and below 1")
-
-
-def check_steps(solver: Any, parts: Sequence[str]) -> None:
-    """Raise a ValueError if an option of a solver is out of range.
-
-    Args:
-        solver: Has tol, factor_reuse_tol, max_iter and max_total_iter.
-        parts: Names of attributes that must lie between 0 and 1.
-    """
-    check_tol(solver.tol)
-    for name in parts:
-        if not 0 < getattr(solver, name) < 1:
-            raise ValueError(f"{name} = {getattr(solver, name)} must lie between 0 and 1")
-    if not 0 <= solver.factor_reuse_tol < math.inf:
-        raise ValueError(f"factor_reuse_tol = {solver.factor_reuse_tol} must be 0 or more")
-    for name in ("max_iter", "max_total_iter"):
-        if getattr(solver, name) < 1:
-            raise ValueError(f"{name} = {getattr(solver, name)} must be 1 or more")
 
 
 class Solver(Protocol):

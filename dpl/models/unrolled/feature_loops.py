@@ -14,11 +14,14 @@ from numba import njit
 from dpl.fem.assembly import constitutive_kernels as point
 from dpl.fem.assembly import numba_laws, simd
 from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
+from dpl.fem.solvers import corotational
+from dpl.fem.solvers.corotational import polar_step
 
 POLAR_ITER = 5  # Newton iterations of a polar decomposition
 MIN_VOLUME_RATIO = 0.05  # det F below which a sample counts as undeformed [-]
 SERIES_ANGLE = 0.3  # rotation angle below which sin(t)/t - 1 is its series [rad]
-SOURCES = "".join(inspect.getsource(m) for m in (simd, numba_laws, point, sys.modules[__name__]))
+MODULES = simd, numba_laws, point, corotational, sys.modules[__name__]
+SOURCES = "".join(inspect.getsource(module) for module in MODULES)
 
 
 @njit(error_model="numpy")
@@ -51,20 +54,6 @@ def rotated_strain(H, out):
                 out[3 * i + j, k] = total + first * W[i][j] + second * nonlinear
 
 
-@njit
-def set_cofactors(X, out):
-    """Set `out` (9, width) to the cofactors of X (9, width); return det X."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        for c in range(3):
-            d, e = (c + 1) % 3, (c + 2) % 3
-            minor = load(X, 3 * j + d) * load(X, 3 * k + e) - load(X, 3 * j + e) * load(
-                X, 3 * k + d
-            )
-            store(out, 3 * i + c, minor)
-    return load(X, 0) * load(out, 0) + load(X, 1) * load(out, 1) + load(X, 2) * load(out, 2)
-
-
 @njit(error_model="numpy")
 def unbalanced_stress(law, c, needs, finite, H, linear, work, out):
     """Set out (18, width) to R^T dP and dP at H (9, width); H is overwritten.
@@ -94,9 +83,7 @@ def unbalanced_stress(law, c, needs, finite, H, linear, work, out):
             store(out, 9 + 3 * i + j, stress)
             store(F, 3 * i + j, load(H, 3 * i + j) + (1.0 if i == j else 0.0))
     for _ in range(POLAR_ITER):
-        half = 0.5 / set_cofactors(F, minors)
-        for r in range(9):
-            store(F, r, 0.5 * load(F, r) + half * load(minors, r))
+        polar_step(F, minors)
     for i in range(3):
         for j in range(3):
             rotated = load(F, i) * load(out, 9 + j)
