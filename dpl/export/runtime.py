@@ -53,15 +53,12 @@ FILE, SOURCES = "runtime.safetensors", ("dpl_runtime.hpp", "dpl_c.h", "dpl_c.cpp
 # in a wheel inside the package, in a checkout in the documentation
 HOME = next(filter(Path.is_dir, [ROOT / "dpl" / "consumers"]), ROOT / "docs" / "consumers")
 LAWS = {  # names of the derivatives that the header has
-    law.invariant_derivatives: name
-    for law, name in {
-        NeoHookeanLn: "neo_hookean_ln",
-        SaintVenantKirchhoff: "hooke",
-        StableNeoHookean: "stable_neo_hookean",
-        YeohK2: "polynomial_k2",
-        NeoHookeanIsoK4: "polynomial_k4",
-        DemirayK2: "demiray_k2",
-    }.items()
+    NeoHookeanLn.invariant_derivatives: "neo_hookean_ln",
+    SaintVenantKirchhoff.invariant_derivatives: "hooke",
+    StableNeoHookean.invariant_derivatives: "stable_neo_hookean",
+    YeohK2.invariant_derivatives: "polynomial_k2",
+    NeoHookeanIsoK4.invariant_derivatives: "polynomial_k4",
+    DemirayK2.invariant_derivatives: "demiray_k2",
 }
 FAMILIES = {ModalLoads.project: "modal", CombinedLoads.project: "combined"}  # others: "other"
 ERROR_STREAM = (0, 13)  # random stream of the loads to which the estimated error is fitted
@@ -209,8 +206,8 @@ def _loads(scene: Scene) -> Arrays:
     if _family(scene) == "other":
         return found
     nodes = np.flatnonzero((shapes != 0).any(axis=(1, 2)))
-    shapes = {"load_nodes": nodes.astype(np.int32), "load_shapes": shapes[nodes]}
-    return found | shapes | {"load_span": np.array(span)}
+    known = {"load_nodes": nodes.astype(np.int32), "load_shapes": shapes[nodes]}
+    return found | known | {"load_span": np.array(span)}
 
 
 def _error(net: Unrolled, samples: int) -> Arrays:
@@ -257,7 +254,8 @@ def _sizes(net: Unrolled, force: Tensor) -> Tensor:
 
 def _patches(problem: Problem) -> Arrays:
     """Return nodes and weights of a uniform traction on each side and boundary group of a body."""
-    mesh, regions = problem.mesh, {}
+    mesh = problem.mesh
+    regions: dict[str, Any] = {}
     for axis, name in enumerate("xyz"):
         regions |= {f"{name}_{end}": Plane(axis, end) for end in ("min", "max")}
     groups = [name for name in mesh.boundaries or {} if name.isprintable()]
