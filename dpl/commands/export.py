@@ -1,4 +1,4 @@
-"""Export a trained surrogate as ONNX, and results for ParaView: python scripts/export.py run=...
+"""Export a trained surrogate: ONNX, results for ParaView, C++: python scripts/export.py run=...
 
 The exit status is 1 if ONNX and torch differ by more than `tol`.
 """
@@ -27,7 +27,7 @@ RESULT_STREAM = (0, 12)  # random stream of the loads in results
 def main(cfg: DictConfig) -> None:
     """Write the parts that `outputs` names."""
     if not cfg.outputs:
-        raise config.ConfigError("outputs = [] must contain one of model, results")
+        raise config.ConfigError("outputs = [] must contain one of model, results, runtime")
     if "results" in cfg.outputs and cfg.count < 1:
         raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or use outputs=[model]")
     config.files_of_run(cfg.run)  # refuses a missing run before torch is imported
@@ -43,6 +43,10 @@ def main(cfg: DictConfig) -> None:
         export_model(cfg, surrogate, folder)
     if "results" in cfg.outputs:
         export_results(cfg, surrogate, folder / "results")
+    if "runtime" in cfg.outputs:
+        with config.error_in("outputs: runtime"):
+            path = export.write_runtime(folder, surrogate, samples=cfg.samples)
+        print(f"for C++: {path}, {path.stat().st_size / 1e6:.3g} MB, with dpl_runtime.hpp")
 
 
 def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder: Path) -> None:

@@ -24,7 +24,7 @@ KEYS: Keys = (  # of all commands
     (bool, "mean_dilatation trust resume solve_reference"),
     (str, "name host"),
     (Literal["generate", "verify", "repair"], "action"),
-    (Sequence[Literal["model", "results"]], "outputs"),
+    (Sequence[Literal["model", "results", "runtime"]], "outputs"),
     (str | None, "run folder ckpt_path animation"),
     (Sequence[str], "tags allowed_hosts"),
     (Sequence[str] | None, "networks"),

@@ -1,4 +1,4 @@
-"""Export of a surrogate: ONNX model, folder with a reference solution, files for ParaView."""
+"""Export of a surrogate: ONNX model with a reference solution, files for ParaView and for C++."""
 
 from typing import TYPE_CHECKING
 
@@ -9,5 +9,6 @@ if TYPE_CHECKING:
     from dpl.export.folder import read_metadata, read_reference, write_folder
     from dpl.export.onnx_graph import ExportGraph, OnnxSession, export_onnx, onnx_opset
     from dpl.export.paraview import write_results
+    from dpl.export.runtime import write_runtime
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -81,9 +81,13 @@ def test_a_graph_with_too_large_a_difference_is_removed(script, trained):
         ),
         (
             ["run=runs/first", "outputs=[modal]"],
-            "outputs = ['modal'] must be a list, each one of model, results",
+            "outputs = ['modal'] must be a list, each one of model, results, runtime",
         ),
-        (["run=runs/first", "outputs=[]"], "outputs = [] must contain one of model, results"),
+        (
+            ["run=runs/first", "outputs=[]"],
+            "outputs = [] must contain one of model, results, runtime",
+        ),
+        (["run=runs/first", "outputs=[runtime]"], "outputs: runtime: the run must be fitted with"),
         (["run=runs/first", "outputs=[results]", "count=0"], "count = 0 must be 1 or more"),
         (["run=runs/first", "tol=0"], "tol = 0 must lie between"),
         (["run=runs/first", "solve_reference=2"], "solve_reference = 2 must be true or false"),

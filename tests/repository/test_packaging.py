@@ -74,7 +74,7 @@ def test_the_wheel_holds_all_configurations_and_says_that_it_is_typed(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     conf = {f"dpl/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
     assert conf <= names
-    assert "dpl/py.typed" in names
+    assert {"dpl/py.typed", "dpl/consumers/dpl_runtime.hpp"} <= names
     assert {name.split("/")[0] for name in names} <= {
         "dpl",
         wheel.name.split("-py3")[0] + ".dist-info",

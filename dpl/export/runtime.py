@@ -1,0 +1,271 @@
+"""File of a fitted `unrolled` model for `dpl_runtime.hpp`, a C++ simulator without dependencies.
+
+The file is in the format of safetensors: 8 bytes with the length of the header, the header in JSON
+with type, shape and place of each array, and the arrays, little-endian, last axis fastest. Lengths
+are over L and forces over E L^2, except for `points` [m]. docs/consumers.md lists the arrays.
+"""
+
+import itertools
+import math
+import shutil
+import zlib
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.numpy import save
+from torch import Tensor
+
+from dpl.fem import (
+    DemirayK2,
+    InvariantBasedMaterial,
+    ModalLoads,
+    NeoHookeanIsoK4,
+    NeoHookeanLn,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    StableNeoHookean,
+    Tag,
+    YeohK2,
+    solve,
+    surface,
+)
+from dpl.fem.assembly.kernels import constants_of
+from dpl.fem.loads.combined import CombinedLoads, VectorLoads
+from dpl.fem.loads.forces import facet_areas
+from dpl.fem.materials.heterogeneous import one_law
+from dpl.fem.mesh.regions import facets_in
+from dpl.fem.postprocess import triangles
+from dpl.models import Unrolled
+from dpl.models.unrolled.features import SampleCells
+from dpl.models.unrolled.fit import Maps
+from dpl.scene import Scene
+from dpl.system.files import atomic_write
+from dpl.training import TrainedSurrogate
+from dpl.version import ROOT, __version__
+
+FORMAT = "dpl runtime 1"
+FILE, SOURCES = "runtime.safetensors", ("dpl_runtime.hpp", "dpl_c.h", "dpl_c.cpp")
+# in a wheel inside the package, in a checkout in the documentation
+HOME = next(filter(Path.is_dir, [ROOT / "dpl" / "consumers"]), ROOT / "docs" / "consumers")
+LAWS = {  # names of the derivatives that the header has
+    NeoHookeanLn.invariant_derivatives: "neo_hookean_ln",
+    SaintVenantKirchhoff.invariant_derivatives: "hooke",
+    StableNeoHookean.invariant_derivatives: "stable_neo_hookean",
+    YeohK2.invariant_derivatives: "polynomial_k2",
+    NeoHookeanIsoK4.invariant_derivatives: "polynomial_k4",
+    DemirayK2.invariant_derivatives: "demiray_k2",
+}
+FAMILIES = {ModalLoads.project: "modal", CombinedLoads.project: "combined"}  # others: "other"
+ERROR_STREAM = (0, 13)  # random stream of the loads to which the estimated error is fitted
+RIDGE = 1.0  # of its exponents, in squares of logarithms
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def write_runtime(folder: Path, surrogate: TrainedSurrogate, *, samples: int) -> Path:
+    """Write `runtime.safetensors` and copy the C++ sources that read it; return its path.
+
+    Args:
+        folder: Folder to write to; created if it does not exist.
+        surrogate: A surrogate with a fitted `Unrolled` model.
+        samples: Loads in range that are solved to fit the estimated error; 0: it is 1e300.
+
+    Raises:
+        ValueError: The header cannot simulate this body or model.
+    """
+    net, scene = surrogate.net, surrogate.scene
+    law = _checked_law(net, scene)
+    fitted = cast(Unrolled, net)
+    arrays = {
+        **_model(fitted),
+        **_body(scene, law),
+        **_loads(scene),
+        **_error(fitted, samples),
+        **_patches(scene.problem),
+    }
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}  # 1-D at least
+    words = {
+        "format": FORMAT,
+        "dpl": __version__,
+        "scene": scene.fingerprint,
+        "law": name_of(law),
+        "loads": _family(scene),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path := folder / FILE) as file:
+        file.write(with_checksum(arrays, words))
+    for name in SOURCES:
+        shutil.copyfile(HOME / name, folder / name)
+    return path
+
+
+def name_of(law: InvariantBasedMaterial) -> str:
+    """Return the name of a law in the header."""
+    return LAWS[type(law).invariant_derivatives] + ("" if law.finite else "_small_strains")
+
+
+def with_checksum(arrays: Arrays, words: dict[str, str]) -> bytes:
+    """Return the content of a file: its CRC-32 with `crc32` = 00000000 is the value of `crc32`."""
+    key, zero = b'"crc32":"%s"', b"0" * 8
+    content = save(arrays, words | {"crc32": zero.decode()})
+    return content.replace(key % zero, key % b"%08x" % zlib.crc32(content), 1)
+
+
+def _checked_law(net: Any, scene: Scene) -> InvariantBasedMaterial:
+    """Return the law of a body that the header can simulate."""
+    problem, ranges = scene.problem, list(scene.loads.parameter_ranges)
+    law = one_law(problem.material)
+    known = getattr(type(law), "invariant_derivatives", None) in LAWS
+    requirements = {
+        "be three-dimensional; use outputs=[model]": problem.shape[1] == 3,
+        f"have no ranges {ranges}; train a model with a number for each": not ranges,
+        f"have one of the laws {', '.join(LAWS.values())}; use outputs=[model]": known,
+        "have no mean dilatation; use outputs=[model]": problem.volume_functions is None,
+        "have no elastic foundation; use outputs=[model]": problem.springs is None,
+        "be fitted with model=unrolled; use outputs=[model]": hasattr(net, "first_map")
+        and net.is_fitted,
+    }
+    for words, is_met in requirements.items():
+        if not is_met:
+            raise ValueError(f"the run must {words}")
+    return cast(InvariantBasedMaterial, law)
+
+
+def _model(net: Unrolled) -> Arrays:
+    """Return the arrays of `dpl.models.unrolled.loops` and of K(0)^-1."""
+    prediction, linear = net._prediction, net.linear
+    (characters, dofs, signs), basis, maps = prediction.arrays
+    law, (inverse, _), _ = net._at_law(net.scene.problem.material)
+    (table, unknowns, _), values = linear.blocks
+    factors = np.append(linear.terms.factors(net.scene.problem.material)[0].numpy(), 1.0)
+    return {
+        "characters": characters,
+        "dofs": dofs.astype(np.int32),
+        "signs": signs,
+        "scales": signs * linear._form.orbits.weight.numpy(),
+        "supports": (factors @ linear._supports.numpy()).reshape(dofs.shape),
+        "columns": basis.columns.astype(np.int32),
+        "modes": basis.modes,
+        "reduced_inverse": inverse,
+        "gradients": maps.gradients,
+        **{name: getattr(maps, name) for name in ("rest", "entry_signs", "first_signs")},
+        "map_signs": maps.map_signs,
+        "first_map": maps.first.swapaxes(-1, -2),
+        "maps": maps.others.swapaxes(-1, -2),
+        "limits": maps.limits,
+        "law_samples": law[1],
+        "front_table": table,
+        "front_unknowns": unknowns.astype(np.int32),
+        "blocks": values,
+    }
+
+
+def _body(scene: Scene, law: InvariantBasedMaterial) -> Arrays:
+    problem = scene.problem
+    corners = problem.basis.nodal_dofs[0][triangles(surface(problem.mesh))]
+    return {
+        "length": np.array(scene.length),
+        "force_unit": np.array(scene.force_unit),
+        "young": np.array(scene.loads.moduli.middle),
+        "points": scene.length * (problem.points.numpy() + problem.origin),
+        "free": problem.free.numpy().astype(np.uint8),
+        "prescribed": problem.prescribed.numpy(),
+        "cells": problem.cells.numpy().astype(np.int32),
+        "dN": problem.dN.numpy(),
+        "dV": problem.dV.numpy(),
+        "law_cells": constants_of(law)[0],
+        "surface": problem.boundary.nonzero()[:, 0].numpy().astype(np.int32),
+        "triangles": corners.astype(np.int32),
+    }
+
+
+def _family(scene: Scene) -> str:
+    """Return how a program recognises the loads of the scene."""
+    found = FAMILIES.get(type(scene.loads).project, "other")
+    return "vector" if found == "combined" and isinstance(scene.loads, VectorLoads) else found
+
+
+def _loads(scene: Scene) -> Arrays:
+    loads, problem = scene.loads, scene.problem
+    constant = loads.constant_force
+    found: Arrays = {
+        "largest_force": np.array(loads.largest_force),
+        "constant_force": np.zeros(problem.shape) if constant is None else constant.numpy(),
+        "loadable": loads.loadable_dofs.numpy().astype(np.uint8),
+    }
+    if isinstance(loads, ModalLoads):
+        shapes, span = loads.modal_forces.numpy(), (*loads._span, *loads._span, 1.0)
+    elif isinstance(loads, CombinedLoads):
+        shapes = loads._acting_shapes.reshape(*problem.shape, -1)
+        span = (*loads.coefficient_range, *loads.sizes, loads.largest_size)
+    if _family(scene) == "other":
+        return found
+    nodes = np.flatnonzero((shapes != 0).any(axis=(1, 2)))
+    known = {"load_nodes": nodes.astype(np.int32), "load_shapes": shapes[nodes]}
+    return found | known | {"load_span": np.array(span)}
+
+
+def _error(net: Unrolled, samples: int) -> Arrays:
+    """Return the regression of the logarithm of the error on those of the sizes of corrections.
+
+    The sizes are the norms of the linear coordinates and of the correction by each map. Exponents
+    are shrunk towards those of the last correction over the linear coordinates.
+    """
+    if not samples:
+        none = np.zeros(2 + len(net.maps))
+        return {"error_factor": np.array(1e300), "error_exponents": none, "least_sizes": none}
+    load = net.scene.loads.sample(ERROR_STREAM, range(samples))
+    with torch.inference_mode():
+        sizes, found = _sizes(net, load.force), net(load.force)
+    exact = torch.cat([solve(net.scene.solver, one).displacement for one in load.unbatch()])
+    errors = (found - exact).flatten(1).norm(dim=1) / exact.flatten(1).norm(dim=1)
+    logs, target = sizes.clamp(min=1e-300).log(), errors.clamp(min=1e-300).log()
+    X, prior = logs - logs.mean(dim=0), torch.zeros_like(logs[0])
+    prior[0], prior[-1] = -1.0, 1.0
+    matrix = X.T @ X + RIDGE * torch.eye(len(prior)).double()
+    exponents = prior + torch.linalg.solve(matrix, X.T @ (target - target.mean() - X @ prior))
+    constant = float(target.mean() - logs.mean(dim=0) @ exponents)
+    return {
+        "error_factor": np.array(math.exp(constant)),
+        "error_exponents": exponents.numpy(),
+        "least_sizes": sizes.amin(dim=0).numpy(),
+    }
+
+
+def _sizes(net: Unrolled, force: Tensor) -> Tensor:
+    """Return the norms of the linear coordinates and of each correction, (B, K + 2)."""
+    problem = net.scene.problem
+    loaded, factors = force.flatten(1)[:, net.dofs], net.linear.terms.factors(problem.material)
+    linear = net._stiffness.solve(factors, loaded @ net.modes.double())
+    cells, law = SampleCells(net.gradients), problem.material.of_cells(net.cells).centred()
+    matrices = net.first_map.double(), list(net.maps.double())
+    present = [
+        Maps(cells, matrices[0], matrices[1][:k], net.limits[: k + 1])(law, linear)
+        for k in range(len(net.maps) + 1)
+    ]
+    steps = [linear, present[0], *(b - a for a, b in itertools.pairwise(present))]
+    return torch.stack([step.norm(dim=1) for step in steps], dim=1)
+
+
+def _patches(problem: Problem) -> Arrays:
+    """Return nodes and weights of a uniform traction on each side and boundary group of a body."""
+    mesh = problem.mesh
+    regions: dict[str, Any] = {}
+    for axis, name in enumerate("xyz"):
+        regions |= {f"{name}_{end}": Plane(axis, end) for end in ("min", "max")}
+    groups = [name for name in mesh.boundaries or {} if name.isprintable()]
+    regions |= {name: Tag(name) for name in groups if not set(name) & set('"\\')}
+    found: Arrays = {}
+    for name, region in regions.items():
+        with suppress(ValueError):  # a side without facets
+            facets = facets_in(region, mesh, problem.length, problem.origin)
+            areas = facet_areas(problem, facets) @ np.ones(len(facets))
+            nodes = np.flatnonzero(areas)
+            found[f"patch.{name}.nodes"] = nodes.astype(np.int32)
+            found[f"patch.{name}.weights"] = areas[nodes] / areas.sum()
+    return found
