@@ -45,7 +45,7 @@ def main(cfg: DictConfig) -> None:
         export_results(cfg, surrogate, folder / "results")
     if "runtime" in cfg.outputs:
         with config.error_in("outputs: runtime"):
-            path = export.write_runtime(folder, surrogate, samples=cfg.samples)
+            path = export.write_runtime(folder, surrogate)
         print(f"for C++: {path}, {path.stat().st_size / 1e6:.3g} MB, with dpl_runtime.hpp")
 
 

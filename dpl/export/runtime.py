@@ -5,7 +5,6 @@ with type, shape and place of each array, and the arrays, little-endian, last ax
 are over L and forces over E L^2, except for `points` [m]. docs/consumers.md lists the arrays.
 """
 
-import itertools
 import math
 import shutil
 import zlib
@@ -17,7 +16,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors.numpy import save
-from torch import Tensor
 
 from dpl.fem import (
     DemirayK2,
@@ -31,18 +29,15 @@ from dpl.fem import (
     StableNeoHookean,
     Tag,
     YeohK2,
-    solve,
     surface,
 )
 from dpl.fem.assembly.kernels import constants_of
-from dpl.fem.loads.combined import CombinedLoads, VectorLoads
 from dpl.fem.loads.forces import facet_areas
+from dpl.fem.loads.sized import CombinedLoads, VectorLoads
 from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.mesh.regions import facets_in
 from dpl.fem.postprocess import triangles
 from dpl.models import Unrolled
-from dpl.models.unrolled.features import SampleCells
-from dpl.models.unrolled.fit import Maps
 from dpl.scene import Scene
 from dpl.system.files import atomic_write
 from dpl.training import TrainedSurrogate
@@ -61,19 +56,16 @@ LAWS = {  # names of the derivatives that the header has
     DemirayK2.invariant_derivatives: "demiray_k2",
 }
 FAMILIES = {ModalLoads.project: "modal", CombinedLoads.project: "combined"}  # others: "other"
-ERROR_STREAM = (0, 13)  # random stream of the loads to which the estimated error is fitted
-RIDGE = 1.0  # of its exponents, in squares of logarithms
 
 Arrays = dict[str, NDArray[Any]]
 
 
-def write_runtime(folder: Path, surrogate: TrainedSurrogate, *, samples: int) -> Path:
+def write_runtime(folder: Path, surrogate: TrainedSurrogate) -> Path:
     """Write `runtime.safetensors` and copy the C++ sources that read it; return its path.
 
     Args:
         folder: Folder to write to; created if it does not exist.
         surrogate: A surrogate with a fitted `Unrolled` model.
-        samples: Loads in range that are solved to fit the estimated error; 0: it is 1e300.
 
     Raises:
         ValueError: The header cannot simulate this body or model.
@@ -85,7 +77,7 @@ def write_runtime(folder: Path, surrogate: TrainedSurrogate, *, samples: int) ->
         **_model(fitted),
         **_body(scene, law),
         **_loads(scene),
-        **_error(fitted, samples),
+        **_error(fitted),
         **_patches(scene.problem),
     }
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}  # 1-D at least
@@ -138,16 +130,16 @@ def _checked_law(net: Any, scene: Scene) -> InvariantBasedMaterial:
 
 def _model(net: Unrolled) -> Arrays:
     """Return the arrays of `dpl.models.unrolled.loops` and of K(0)^-1."""
-    prediction, linear = net._prediction, net.linear
-    (characters, dofs, signs), basis, maps = prediction.arrays
-    law, (inverse, _), _ = net._at_law(net.scene.problem.material)
+    (arrays, _), linear = net._arrays, net.linear
+    (characters, dofs, signs, scales), basis, maps = arrays
+    law, inverse, _ = net._at(torch.zeros(1, 0))
     (table, unknowns, _), values = linear.blocks
     factors = np.append(linear.terms.factors(net.scene.problem.material)[0].numpy(), 1.0)
     return {
         "characters": characters,
         "dofs": dofs.astype(np.int32),
         "signs": signs,
-        "scales": signs * linear._form.orbits.weight.numpy(),
+        "scales": scales,
         "supports": (factors @ linear._supports.numpy()).reshape(dofs.shape),
         "columns": basis.columns.astype(np.int32),
         "modes": basis.modes,
@@ -155,8 +147,8 @@ def _model(net: Unrolled) -> Arrays:
         "gradients": maps.gradients,
         **{name: getattr(maps, name) for name in ("rest", "entry_signs", "first_signs")},
         "map_signs": maps.map_signs,
-        "first_map": maps.first.swapaxes(-1, -2),
-        "maps": maps.others.swapaxes(-1, -2),
+        "first_map": maps.first,
+        "maps": maps.others,
         "limits": maps.limits,
         "law_samples": law[1],
         "front_table": table,
@@ -210,46 +202,13 @@ def _loads(scene: Scene) -> Arrays:
     return found | known | {"load_span": np.array(span)}
 
 
-def _error(net: Unrolled, samples: int) -> Arrays:
-    """Return the regression of the logarithm of the error on those of the sizes of corrections.
-
-    The sizes are the norms of the linear coordinates and of the correction by each map. Exponents
-    are shrunk towards those of the last correction over the linear coordinates.
-    """
-    if not samples:
-        none = np.zeros(2 + len(net.maps))
-        return {"error_factor": np.array(1e300), "error_exponents": none, "least_sizes": none}
-    load = net.scene.loads.sample(ERROR_STREAM, range(samples))
-    with torch.inference_mode():
-        sizes, found = _sizes(net, load.force), net(load.force)
-    exact = torch.cat([solve(net.scene.solver, one).displacement for one in load.unbatch()])
-    errors = (found - exact).flatten(1).norm(dim=1) / exact.flatten(1).norm(dim=1)
-    logs, target = sizes.clamp(min=1e-300).log(), errors.clamp(min=1e-300).log()
-    X, prior = logs - logs.mean(dim=0), torch.zeros_like(logs[0])
-    prior[0], prior[-1] = -1.0, 1.0
-    matrix = X.T @ X + RIDGE * torch.eye(len(prior)).double()
-    exponents = prior + torch.linalg.solve(matrix, X.T @ (target - target.mean() - X @ prior))
-    constant = float(target.mean() - logs.mean(dim=0) @ exponents)
+def _error(net: Unrolled) -> Arrays:
+    """Return the estimated error of the prediction."""
     return {
-        "error_factor": np.array(math.exp(constant)),
-        "error_exponents": exponents.numpy(),
-        "least_sizes": sizes.amin(dim=0).numpy(),
+        "error_factor": np.array(net._doubt * math.exp(net.error_factors[0])),
+        "error_exponents": net.error_exponents[0].numpy(),
+        "least_sizes": net.least_sizes.numpy(),
     }
-
-
-def _sizes(net: Unrolled, force: Tensor) -> Tensor:
-    """Return the norms of the linear coordinates and of each correction, (B, K + 2)."""
-    problem = net.scene.problem
-    loaded, factors = force.flatten(1)[:, net.dofs], net.linear.terms.factors(problem.material)
-    linear = net._stiffness.solve(factors, loaded @ net.modes.double())
-    cells, law = SampleCells(net.gradients), problem.material.of_cells(net.cells).centred()
-    matrices = net.first_map.double(), list(net.maps.double())
-    present = [
-        Maps(cells, matrices[0], matrices[1][:k], net.limits[: k + 1])(law, linear)
-        for k in range(len(net.maps) + 1)
-    ]
-    steps = [linear, present[0], *(b - a for a, b in itertools.pairwise(present))]
-    return torch.stack([step.norm(dim=1) for step in steps], dim=1)
 
 
 def _patches(problem: Problem) -> Arrays:
