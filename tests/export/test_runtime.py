@@ -263,8 +263,11 @@ def test_the_error_in_range_is_that_of_the_model(beam):
     load = surrogate.scene.loads.sample(5, range(8))
     with torch.inference_mode():
         errors = surrogate.net.forward_with_errors(load.force)[1][:, 0]
-    for force, expected in zip(surrogate.scene.si_inputs(load)["force"], errors, strict=True):
-        assert cpp.solve(force.numpy())[2].error == pytest.approx(float(expected), rel=1e-3)
+    forces = surrogate.scene.si_inputs(load)["force"].numpy()
+    reports = [cpp.solve(force)[2] for force in forces]
+    pairs = [(r.error, float(e)) for r, e in zip(reports, errors, strict=True) if r.residual < 1]
+    assert len(pairs) > 3, "where the residual exceeds the load the rotated stiffness decides"
+    assert [found for found, _ in pairs] == pytest.approx([e for _, e in pairs], rel=1e-3)
 
 
 def test_the_error_out_of_range_is_that_of_the_rotated_stiffness(beam):
