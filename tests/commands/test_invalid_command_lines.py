@@ -10,7 +10,7 @@ from hydra.core.global_hydra import GlobalHydra
 from dpl.commands import dry_run, generate, train
 from dpl.config import ConfigError, plain
 
-OPTIONS = "Available options in 'model': cnn fcnn gnn pod unrolled"
+OPTIONS = "Available options in 'model': cnn fcnn fcnn_paper gnn pod unrolled"
 EXPERIMENTS = "Available options in 'experiment': beam_nh_loss beam_poisson beam_svk "
 NONSENSE = {  # command line -> what the one line says
     "train experiment=beam_yuong": f"Could not find 'experiment/beam_yuong' {EXPERIMENTS}",

@@ -67,7 +67,7 @@ class AndersonSolver:
         u = torch.where(problem.free, guess, problem.prescribed)
         evaluation = problem.evaluate(u)
         state = evaluate_solution(
-            problem, u, load, self.tol,
+            self.problem, u, load, self.tol,
             seconds=time.perf_counter() - start, from_guess=True, evaluation=evaluation,
         )  # fmt: skip
         yield state
