@@ -66,17 +66,17 @@ def draw_method(net: Unrolled, test: Sample, path: Path) -> None:
     shapes = [panel.displacement for panel in panels if panel.displacement is not None]
     problem = net.scene.problem
     kind = {"projection": "3d"} if problem.shape[1] == 3 else {}
-    with picture(path, 3.7) as figure:
+    with picture(path, 4.4) as figure:
         figure.set_layout_engine("none")
-        room = {"left": 0.01, "bottom": -0.02, "right": 0.99, "top": 0.88}
-        axes = figure.subplots(2, 3, subplot_kw=kind, gridspec_kw={**room, "hspace": 0.3})
+        room = {"left": 0.01, "bottom": -0.02, "right": 0.99, "top": 0.9}
+        axes = figure.subplots(2, 3, subplot_kw=kind, gridspec_kw={**room, "hspace": 0.25})
         for k, (ax, panel) in enumerate(zip(axes.flat, panels, strict=True)):
             draw_body(
                 ax, problem, panel.displacement, values=panel.values, colours="YlOrRd", fit=shapes
             )
             if kind:
                 sides = ax.get_xlim(), ax.get_ylim(), ax.get_zlim()
-                ax.set_box_aspect([high - low for low, high in sides], zoom=1.7)
+                ax.set_box_aspect([high - low for low, high in sides], zoom=1.4)
             ax.set_title(f"{k + 1}. {panel.title}")
             if panel.points is not None:
                 ax.computed_zorder = False  # of axes in 3D: the points lie inside the body

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -175,5 +176,8 @@ def draw(rows: Sequence[Result], path: Path) -> None:
                 colours,
             )
             ax.set(xscale="log", xlabel="relative L2 error")
+            low, high = np.log10(ax.get_xlim())
+            ax.set_xlim(10 ** np.floor(low), 10 ** np.ceil(high))  # whole decades have labels
+            ax.xaxis.set_minor_formatter("")
             ax.set_title(TITLES.get(title, title))
         dots_legend(figure, "median of the loads", "largest")
