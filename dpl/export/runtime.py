@@ -177,7 +177,7 @@ def _body(scene: Scene, law: InvariantBasedMaterial) -> Arrays:
 
 
 def _family(scene: Scene) -> str:
-    """Return how a program recognises the loads of the scene."""
+    """Return the name of the load family in the file: modal, vector, combined or other."""
     found = FAMILIES.get(type(scene.loads).project, "other")
     return "vector" if found == "combined" and isinstance(scene.loads, VectorLoads) else found
 
@@ -190,13 +190,13 @@ def _loads(scene: Scene) -> Arrays:
         "constant_force": np.zeros(problem.shape) if constant is None else constant.numpy(),
         "loadable": loads.loadable_dofs.numpy().astype(np.uint8),
     }
+    if _family(scene) == "other":
+        return found
     if isinstance(loads, ModalLoads):
         shapes, span = loads.modal_forces.numpy(), (*loads._span, *loads._span, 1.0)
     elif isinstance(loads, CombinedLoads):
         shapes = loads._acting_shapes.reshape(*problem.shape, -1)
         span = (*loads.coefficient_range, *loads.sizes, loads.largest_size)
-    if _family(scene) == "other":
-        return found
     nodes = np.flatnonzero((shapes != 0).any(axis=(1, 2)))
     known = {"load_nodes": nodes.astype(np.int32), "load_shapes": shapes[nodes]}
     return found | known | {"load_span": np.array(span)}

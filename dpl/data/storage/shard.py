@@ -185,7 +185,7 @@ def _flaw_of_solutions(
 
 
 def _flaw_of_shapes(columns: Columns, shapes: Mapping[str, tuple[int, ...]]) -> str:
-    """Return which column has another shape or type, or is not finite; empty if none."""
+    """Return the error of the first column of wrong shape, type or value; empty without one."""
     for name, expected in shapes.items():
         column = columns[name]
         if (tuple(column.shape), column.dtype) != (expected, INTEGERS.get(name, torch.float64)):

@@ -67,7 +67,7 @@ class Shard(NamedTuple):
 
     @property
     def accepted(self) -> Tensor:
-        """Whether each of its loads was accepted, (T,)."""
+        """Mask of the accepted loads among `tried`, (T,)."""
         return torch.isin(self.columns["tried"], self.columns["index"])
 
 

@@ -1,8 +1,7 @@
 """A SIMD vector of doubles as a number type of numba.
 
-LLVM does not vectorise the loops over cells by itself, because it cannot prove that the workspaces
-do not overlap. A value of type `SIMDVector` is a vector register. `load` and `store` transfer rows
-of arrays (rows, SIMD_WIDTH); the operators + - * / take vectors and numbers.
+The loops over cells process one cell in each lane. A value of type `SIMDVector` is a vector
+register. `load` and `store` transfer rows of arrays (rows, SIMD_WIDTH); the operators + - * / take vectors and numbers.
 """
 
 import math
