@@ -1,7 +1,8 @@
 """A SIMD vector of doubles as a number type of numba.
 
 The loops over cells process one cell in each lane. A value of type `SIMDVector` is a vector
-register. `load` and `store` transfer rows of arrays (rows, SIMD_WIDTH); the operators + - * / take vectors and numbers.
+register. `load` and `store` transfer rows of arrays (rows, SIMD_WIDTH); the operators + - * / take
+vectors and numbers.
 """
 
 import math
