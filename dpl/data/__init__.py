@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from dpl.data.datamodule import DataModule
     from dpl.data.dataset import DataSet
     from dpl.data.growing import Growing
+    from dpl.data.pairs import PairData
     from dpl.data.samples import Samples
     from dpl.data.sources import Source, Stored, Stream
     from dpl.data.storage.store import Store

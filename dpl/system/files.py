@@ -124,11 +124,16 @@ def _check_regular_file(path: Path, most: float) -> None:
         )
 
 
-def read_array(path: Path, row: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the array in a .npy file, or the only one in a .npz file, (S, *row) with S > 0.
+def read_array(path: Path, row: tuple[int, ...], name: str | None = None) -> NDArray[np.float64]:
+    """Return the array in a .npy file, or one in a .npz file, (S, *row) with S > 0.
 
     The kind and the size of the file, and type and shape in the header of the array, are checked
     before the array is read.
+
+    Args:
+        path: The file.
+        row: Shape of a row; -1 for any number.
+        name: Name of the array in a .npz file with several.
 
     Raises:
         OSError: The file cannot be opened.
@@ -146,8 +151,15 @@ def read_array(path: Path, row: tuple[int, ...]) -> NDArray[np.float64]:
             if path.suffix == ".npy":
                 return _read_npy(file, status.st_size, row)
             with zipfile.ZipFile(file) as archive:
-                if len(members := archive.infolist()) != 1:
-                    raise ValueError(f"the file must contain one array and has {len(members)}")
+                members = archive.infolist()
+                if len(members) != 1 and name is not None:
+                    members = [one for one in members if one.filename == f"{name}.npy"]
+                if len(members) != 1:
+                    which = "one array" if name is None else f"an array {name!r}"
+                    raise ValueError(
+                        f"the file must contain {which} and has {len(archive.infolist())}: "
+                        f"{', '.join(array_names(archive)) or 'none'}"
+                    )
                 if members[0].compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                     raise ValueError("the file must be written by numpy.savez")
                 with archive.open(members[0]) as member:
@@ -158,13 +170,27 @@ def read_array(path: Path, row: tuple[int, ...]) -> NDArray[np.float64]:
             raise ValueError(f"the file is damaged: {' '.join(str(error).split())}") from error
 
 
+def array_names(file: Path | zipfile.ZipFile) -> list[str]:
+    """Return the names of the arrays in a .npz file; none if it is no archive."""
+    if isinstance(file, zipfile.ZipFile):
+        return [name.removesuffix(".npy") for name in file.namelist()]
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return array_names(archive)
+    except zipfile.BadZipFile:
+        return []
+
+
 def _read_npy(file: IO[bytes], size: int, row: tuple[int, ...]) -> NDArray[np.float64]:
     """Return the array (S, *row) of a .npy file of so many bytes."""
     headers = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
     shape, fortran, dtype = headers[np.lib.format.read_magic(file)[0] == 2](file)
     count, body = math.prod(shape), size - file.tell()
-    if dtype.kind not in "fiu" or shape[1:] != row or not count > 0:
-        wanted = ", ".join(map(str, row))
+    fits = len(shape) == 1 + len(row) and all(
+        n in (-1, given) for n, given in zip(row, shape[1:], strict=True)
+    )
+    if dtype.kind not in "fiu" or not fits or not count > 0:
+        wanted = ", ".join("any" if n == -1 else str(n) for n in row)
         raise ValueError(f"the array of {dtype} of shape {shape} must be numbers (S, {wanted})")
     if count * dtype.itemsize != body:
         raise ValueError(f"the file is damaged: {body:,} bytes for an array of shape {shape}")

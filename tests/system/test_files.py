@@ -113,8 +113,8 @@ HARMFUL = {  # name of a file -> how it is made, what the message says
     ),
     "unfolds.npz": (lambda path: pack(path, header(200_000, 4, 2) + bytes(12_800_000)), "at most"),
     "other.npz": (lambda path: pack(path, header(1, 4, 2) + bytes(64), zipfile.ZIP_LZMA), "savez"),
-    "none.npz": (lambda path: np.savez(path), "has 0"),
-    "two.npz": (lambda path: np.savez(path, a=np.ones(1), b=np.ones(1)), "has 2"),
+    "none.npz": (lambda path: np.savez(path), "has 0: none"),
+    "two.npz": (lambda path: np.savez(path, a=np.ones(1), b=np.ones(1)), "has 2: a, b"),
     "damaged.npz": (lambda path: path.write_bytes(b"PK\x03\x04 damaged"), "zip"),
 }
 

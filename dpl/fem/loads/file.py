@@ -15,8 +15,8 @@ from dpl.fem.identity import plain
 from dpl.fem.loads.fit import best_fit
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import CombinedLoads
+from dpl.fem.mesh.nodal_fields import read_nodal_fields
 from dpl.fem.options import option
-from dpl.system.files import read_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,14 +26,20 @@ class FileLoads(CombinedLoads):
     The numbers of a force are its number in the file and the factor.
 
     Attributes:
-        path: An array in .npy, or a .npz file with one array: nodal forces (S, N, D) [N] (2D:
-            [N/m]), 2^27 numbers at most, the nodes in the order of `Problem.points`.
+        path: Nodal forces (S, N, D) [N] (2D: [N/m]), 2^27 numbers at most: a file of arrays or a
+            folder of VTK files, see `dpl.fem.mesh.nodal_fields`.
         factor: Smallest and largest factor; None: `deflection` decides, and the unit of the forces
             has no effect.
+        field: Name of the array, in a file with several.
+        unit: Unit of the forces [N].
+        scale: Unit of the points in the file [m].
     """
 
     path: str | Path
     factor: Sequence[float] | None = option("", default=(0.0, 1.0), nonzero=True)
+    field: str = "force"
+    unit: float = 1.0
+    scale: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -42,8 +48,11 @@ class FileLoads(CombinedLoads):
     @cached_property
     def _forces(self) -> Array:
         """Forces of the file, (S, N, D) [N]."""
+        body, names = self.problem, [self.field]
+        points = body.length * (body.origin + body.points.numpy())
         try:
-            return read_forces(self.path, self.problem.free.numpy())
+            (forces,) = read_nodal_fields(self.path, names, points, self.scale)
+            return self.unit * checked_forces(forces, body.free.numpy())
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else error
             raise ValueError(f"path = {self.path}: {' '.join(str(reason).split())}") from error
@@ -103,22 +112,17 @@ class FileLoads(CombinedLoads):
     def identity(self) -> dict[str, Any]:
         """Return the options; the file is identified by its forces over the largest component."""
         options = super().identity()
-        del options["path"], options["factor"]
+        for name in ("path", "field", "unit", "scale", "factor"):
+            del options[name]
         return options | {"forces": plain(self.shapes)}
 
 
-def read_forces(path: str | Path, free: NDArray[np.bool_]) -> Array:
-    """Return the forces of a .npy or .npz file, (S, N, D) [N].
-
-    Args:
-        path: The file, which need not be trusted, see `dpl.system.files.read_array`.
-        free: Free degrees of freedom, (N, D); each force must act on one.
+def checked_forces(forces: Array, free: NDArray[np.bool_]) -> Array:
+    """Return forces (S, N, D) that are finite and act on a free degree of freedom (N, D).
 
     Raises:
-        OSError: The file cannot be read.
-        ValueError: It does not contain one array of finite forces of this shape.
+        ValueError: A force does not; the message names its number.
     """
-    forces = read_array(Path(path), free.shape)
     for number, force in enumerate(forces):
         if not np.isfinite(force).all():
             raise ValueError(f"force {number} must have finite components")

@@ -1,0 +1,218 @@
+"""Training data that another solver computed: pairs of forces and displacements in files."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+
+from dpl.data.datamodule import DataModule
+from dpl.data.dataset import DataSet
+from dpl.data.sources import Stored
+from dpl.fem import Problem
+from dpl.fem.mesh.nodal_fields import read_nodal_fields
+from dpl.scene import Sample, Scene
+
+FEW = 16  # pairs to which constants of the law are fitted
+POISSON = (0.0, 0.4999)  # range of Poisson's ratio in this fit [-]
+BATCH = 8  # pairs whose residuals are computed together
+
+
+class LawFit(NamedTuple):
+    """Constants of a law with the smallest residuals.
+
+    Attributes:
+        young: Young's modulus over that of the scene [-].
+        poisson: Poisson's ratio [-]; None for a law without this constant.
+        residual: Root mean square of the relative residuals [-].
+    """
+
+    young: float
+    poisson: float | None
+    residual: float
+
+
+class _Read(Stored):
+    """Training samples of which nothing has to be solved."""
+
+    def fits(self, dataset: DataSet) -> Iterator[dict[str, int]]:
+        yield {"train": self.train, "val": dataset.val, "test": dataset.test}
+
+
+class PairData(DataModule):
+    """Forces and displacements of another solver, divided at random into three splits.
+
+    Pairs are used if they are equilibria of the law of the scene: relative residual and error of
+    the supports are at most `tol`.
+
+    Attributes:
+        pairs: All pairs in the order of the files.
+        residuals: Their relative residuals, (S,) [-].
+        support_errors: Their largest error at a prescribed displacement over their largest
+            displacement, (S,) [-].
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        path: str,
+        force: str = "force",
+        displacement: str = "displacement",
+        force_unit: float = 1.0,
+        length_unit: float = 1.0,
+        tol: float = 1e-3,
+        val: int = 32,
+        test: int = 50,
+        seed: int = 0,
+        shuffle_seed: int = 0,
+        batch_size: int = 64,
+        symmetry: bool = False,
+    ) -> None:
+        """Read the pairs and compare them with equilibria of the law.
+
+        Args:
+            scene: Body, law and supports, with one Young's modulus and no other ranges.
+            path: File of arrays or folder of VTK files, see `dpl.fem.mesh.nodal_fields`.
+            force: Name of the nodal forces.
+            displacement: Name of the displacements.
+            force_unit: Unit of the forces [N].
+            length_unit: Unit of displacements and points [m].
+            tol: Largest relative residual of a pair that is used [-].
+            val: Number of pairs to validate on.
+            test: Number of pairs to test on.
+            seed: Seed of the division.
+            shuffle_seed: Seed of the order of the samples in the batches.
+            batch_size: Samples in a batch.
+            symmetry: Train also on the images of each sample under the symmetries of the body.
+
+        Raises:
+            ValueError: The files cannot be read or do not belong to the body, or too few pairs are
+                equilibria; then the message contains the constants of the law that fit best.
+        """
+        self._path, self._tol = Path(path), tol
+        names, units = (force, displacement), (force_unit, length_unit)
+        self.pairs = read_pairs(scene, self._path, names, units)
+        load, u = self.pairs.load, self.pairs.displacement
+        self.residuals = torch.cat(list(_residuals(scene.problem, u, load.force)))
+        wrong = torch.where(scene.problem.free, 0.0, u - scene.problem.prescribed)
+        self.support_errors = _largest(wrong) / _largest(u).clamp(min=1e-300)
+        self._usable = ((self.residuals <= tol) & (self.support_errors <= tol)).nonzero()[:, 0]
+        if (train := len(self._usable) - val - test) < 1:
+            raise ValueError(self._refusal(scene.problem, float(load.young[0]), val + test))
+        super().__init__(
+            scene, train=_Read(train), val=val, test=test, seed=seed, shuffle_seed=shuffle_seed,
+            batch_size=batch_size, symmetry=symmetry, workers=0,
+        )  # fmt: skip
+
+    def _refusal(self, body: Problem, young: float, needed: int) -> str:
+        """Return why too few pairs can be used, and the constants that fit best."""
+        few = self.pairs.load.force[:FEW], self.pairs.displacement[:FEW]
+        fit = fit_law(body, *few)
+        best = f"young = {fit.young * young:.4g}"
+        best += "" if fit.poisson is None else f" and poisson = {fit.poisson:.4g}"
+        moved = int((self.support_errors > self._tol).sum())
+        return (
+            f"path = {self._path}: {len(self._usable)} of {len(self.residuals)} pairs are "
+            f"equilibria of this law, more than {needed} are needed; the median residual is "
+            f"{float(self.residuals.median()):.2g} and tol = {self._tol:g}, supports move in "
+            f"{moved} pairs; the residual of the first pairs is smallest, {fit.residual:.2g}, "
+            f"with {best}"
+        )
+
+    def describe(self) -> list[tuple[str, str]]:
+        """Return how many pairs are used, and their residuals."""
+        sizes = ", ".join(f"{size:,} {split}" for split, size in self.sizes.items())
+        used, total = self.residuals[self._usable], len(self.residuals)
+        residuals = f"median {float(used.median()):.2g}, largest {float(used.max()):.2g}"
+        return [
+            ("data", f"{len(used):,} of {total:,} pairs of {self._path}: {sizes}"),
+            ("", f"residuals under this law: {residuals}; others above {self._tol:g}"),
+        ]
+
+    def skipped_work(self) -> list[str]:
+        """Return one line for each kind of work that is not needed."""
+        return ["no load solved: all displacements are read"]
+
+    def prepare_data(self) -> None:
+        """Do nothing: the pairs have been read."""
+
+    def samples(self, split: str) -> Sample:
+        """Return a split, (B, ...) in float64."""
+        generator = torch.Generator().manual_seed(self.dataset.seed)
+        order = self._usable[torch.randperm(len(self._usable), generator=generator)]
+        names = list(self.sizes)
+        parts = dict(zip(names, order.split(list(self.sizes.values())), strict=True))
+        return Sample(*(column[parts[split]] for column in self.pairs))
+
+
+def read_pairs(
+    scene: Scene, path: Path, names: tuple[str, str], units: tuple[float, float]
+) -> Sample:
+    """Return pairs of another solver, (S, N, D), see `PairData` for arguments and errors."""
+    body, young = scene.problem, scene.loads.moduli
+    if young[0] != young[1] or scene.loads.parameter_ranges:
+        raise ValueError("pairs belong to one body; young and constants of the law must be numbers")
+    points = body.length * (body.origin + body.points.numpy())
+    try:
+        force, displacement = read_nodal_fields(path, names, points, units[1])
+        if len(force) != len(displacement):
+            counts = f"{len(force)} forces and {len(displacement)} displacements"
+            raise ValueError(f"there are {counts}; they must be pairs")
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise ValueError(f"path = {path}: {' '.join(str(reason).split())}") from error
+    modulus = torch.full((len(force),), float(young[0]), dtype=torch.float64)
+    load = scene.load_of(units[0] * torch.from_numpy(force), modulus)
+    u = torch.from_numpy(displacement) * (units[1] / body.length)
+    if not (load.force.isfinite().all() and u.isfinite().all()):
+        raise ValueError(f"path = {path}: all forces and displacements must be finite")
+    return Sample(load.force, u, modulus)
+
+
+def fit_law(body: Problem, force: Tensor, displacement: Tensor) -> LawFit:
+    """Return the constants of the law of a body with the smallest residuals of some pairs.
+
+    Young's modulus is a linear least-squares fit. If the law has a number `poisson`, it is found by
+    bounded minimisation (Brent 1973).
+
+    Args:
+        body: Body and law.
+        force: Nodal forces, (S, N, D) [-].
+        displacement: Displacements, (S, N, D) [-].
+    """
+    if not isinstance(getattr(body.material, "poisson", None), float):
+        return _fit_modulus(body, force, displacement)
+
+    def fit(poisson: float) -> LawFit:
+        law = replace(body.material, poisson=poisson)  # type: ignore[call-arg]
+        return _fit_modulus(replace(body, material=law), force, displacement, poisson)
+
+    found = minimize_scalar(lambda x: fit(float(x)).residual, bounds=POISSON, method="bounded")
+    return fit(float(found.x))
+
+
+def _fit_modulus(
+    body: Problem, force: Tensor, displacement: Tensor, poisson: float | None = None
+) -> LawFit:
+    """Return the best Young's modulus of a law whose other constants are given."""
+    given = body.acting(force).flatten(1)
+    size = given.norm(dim=1, keepdim=True)
+    computed = body.acting(body.internal_force(displacement)).flatten(1) / size
+    given = given / size
+    young = (given * computed).sum() / computed.square().sum()
+    residual = (given - young * computed).square().sum(dim=1).mean().sqrt()
+    return LawFit(float(young), poisson, float(residual))
+
+
+def _residuals(body: Problem, displacement: Tensor, force: Tensor) -> Iterable[Tensor]:
+    for pair in zip(displacement.split(BATCH), force.split(BATCH), strict=True):
+        yield body.relative_residual(*pair)
+
+
+def _largest(field: Tensor) -> Tensor:
+    """Return the largest component of each field (B, N, D), (B,)."""
+    return field.flatten(1).abs().amax(dim=1)
