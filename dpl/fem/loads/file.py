@@ -18,6 +18,9 @@ from dpl.fem.loads.sized import CombinedLoads
 from dpl.fem.mesh.nodal_fields import read_nodal_fields
 from dpl.fem.options import option
 
+BUCKETS = 256  # numbers of a sketch
+CANDIDATES = 4  # forces with the most similar sketches, which are compared with a force
+
 
 @dataclass(frozen=True, eq=False)
 class FileLoads(CombinedLoads):
@@ -98,16 +101,22 @@ class FileLoads(CombinedLoads):
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return amplitudes (B,) and relative residuals (B,) for the force that fits best."""
-        shapes = torch.from_numpy(self._acting_shapes)  # (N D, S)
         own = self.own_force(force).flatten(1)
-        products, squares = own @ shapes, shapes.square().sum(dim=0)
-        factors, size = products / squares, own.norm(dim=1).clamp(min=1e-300)
-        cosines = products / squares.sqrt() / size[:, None]
+        size = own.norm(dim=1, keepdim=True).clamp(min=1e-300)
+        cosines = (_sketch(own / size) @ self._sketches).abs()
+        near = cosines.topk(min(CANDIDATES, len(self.shapes)), dim=1).indices  # (B, C)
+        shapes = self.problem.acting(self.shapes[near]).flatten(2)  # (B, C, N D)
+        factors = (shapes @ own[..., None])[..., 0] / shapes.square().sum(dim=2)
+        rest = (own[:, None] - factors[..., None] * shapes).norm(dim=2) / size
         amplitude = torch.from_numpy(self.amplitudes(factors.numpy()))
-        apart = (1 - cosines.square()).clamp(min=0.0).sqrt()
-        rows, best = torch.arange(len(own)), best_fit(amplitude.T.numpy(), apart.T.numpy())
-        rest = (own - factors[rows, best][:, None] * shapes[:, best].T).norm(dim=1)
-        return amplitude[rows, best], rest / size
+        rows, best = torch.arange(len(own)), best_fit(amplitude.T.numpy(), rest.T.numpy())
+        return amplitude[rows, best], rest[rows, best]
+
+    @cached_property
+    def _sketches(self) -> Tensor:
+        """Unit vectors of the sketches of all forces, (BUCKETS, S)."""
+        sketches = _sketch(self.problem.acting(self.shapes).flatten(1))
+        return torch.nn.functional.normalize(sketches, dim=1).T.contiguous()
 
     def identity(self) -> dict[str, Any]:
         """Return the options; the file is identified by its forces over the largest component."""
@@ -115,6 +124,19 @@ class FileLoads(CombinedLoads):
         for name in ("path", "field", "unit", "scale", "factor"):
             del options[name]
         return options | {"forces": plain(self.shapes)}
+
+
+def _sketch(vectors: Tensor) -> Tensor:
+    """Return sums of random parts of vectors (B, n) with random signs, (B, BUCKETS).
+
+    Sketches of parallel vectors are parallel, and those of other vectors seldom are.
+
+    Source: Charikar, Chen, Farach-Colton (2002), ICALP, section 3 (count sketch).
+    """
+    generator, n = torch.Generator().manual_seed(0), vectors.shape[1]
+    signs = 2.0 * torch.randint(2, (n,), generator=generator) - 1
+    buckets = torch.randint(BUCKETS, (n,), generator=generator)
+    return vectors.new_zeros(len(vectors), BUCKETS).index_add_(1, buckets, signs * vectors)
 
 
 def checked_forces(forces: Array, free: NDArray[np.bool_]) -> Array:
