@@ -27,7 +27,8 @@ RESULT_STREAM = (0, 12)  # random stream of the loads in results
 def main(cfg: DictConfig) -> None:
     """Write the parts that `outputs` names."""
     if not cfg.outputs:
-        raise config.ConfigError("outputs = [] must contain one of model, results, runtime")
+        known = "model, results, runtime, dataset, publish"
+        raise config.ConfigError(f"outputs = [] must contain one of {known}")
     if "results" in cfg.outputs and cfg.count < 1:
         raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or use outputs=[model]")
     config.files_of_run(cfg.run)  # refuses a missing run before torch is imported
@@ -37,7 +38,7 @@ def main(cfg: DictConfig) -> None:
         raise config.ConfigError(
             f"outputs: model needs {', '.join(absent)}: {install('onnx')}, or use outputs=[results]"
         )
-    _, surrogate = config.load_run(cfg.run, trust=cfg.trust)
+    run, surrogate = config.load_run(cfg.run, trust=cfg.trust)
     folder = Path(cfg.run) / "export" if cfg.folder is None else Path(cfg.folder)
     if "model" in cfg.outputs:
         export_model(cfg, surrogate, folder)
@@ -47,6 +48,25 @@ def main(cfg: DictConfig) -> None:
         with config.error_in("outputs: runtime"):
             path = export.write_runtime(folder, surrogate)
         print(f"for C++: {path}, {path.stat().st_size / 1e6:.3g} MB, with dpl_runtime.hpp")
+    if "dataset" in cfg.outputs:
+        data = config.load_data(run, surrogate.scene)
+        splits = {split: data.samples(split) for split, size in data.sizes.items() if size}
+        path = export.write_pairs(surrogate.scene, splits, folder / "dataset")
+        print(f"for other programs: {path}, {path.stat().st_size / 1e6:.3g} MB")
+    if "publish" in cfg.outputs:
+        with config.error_in("outputs: publish"):
+            path = publish(cfg, run, surrogate.scene, folder / "published")
+        print(f"to share: {path.parent}; dpl.load reads this folder, also as hf://OWNER/NAME")
+
+
+def publish(cfg: DictConfig, run: DictConfig, scene: "dpl.Scene", folder: Path) -> Path:
+    """Write what `dpl.load` needs of a run to a folder; return the card."""
+    kept = {key: node for key, node in config.to_container(run).items() if key in config.PREDICTION}
+    _, files = config.with_copied_files(run, Path(cfg.run), required=True)
+    copies = [own for _, own in files.values()]
+    return export.write_published(
+        scene, folder, config=kept, files=copies, run=Path(cfg.run), license=cfg.license
+    )
 
 
 def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder: Path) -> None:

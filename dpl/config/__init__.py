@@ -29,10 +29,12 @@ if TYPE_CHECKING:
         with_files_of_resumed,
     )
     from dpl.config.run_folder import (
+        PREDICTION,
         load_data,
         load_run,
         load_runs,
         training_loads,
+        with_copied_files,
     )
     from dpl.config.validation import ConfigError, Keys
     from dpl.version import CONF

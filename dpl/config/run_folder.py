@@ -3,6 +3,8 @@
 import contextlib
 import json
 import os
+import shutil
+import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,10 +21,13 @@ from dpl.config.validation import ConfigError
 from dpl.scene import Scene
 from dpl.system.memory import at_most
 from dpl.training import checkpoints
+from dpl.version import install
 
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
 OF_SCENE = (*SCENE, "fixed", "regions")
 PREDICTION = (*OF_SCENE, "model", "seed")  # keys of a run that `load` reads
+HUB = "hf://"  # begins the names of runs on the Hugging Face Hub
+SHARED = ["config.yaml", "checkpoints/*.safetensors", "*.vtu", "*.npy", "*.npz", "*.safetensors"]
 UNUSABLE = (  # errors of a damaged checkpoint
     *(OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, ArithmeticError),
 )
@@ -172,7 +177,8 @@ def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":
     """Return the simulator of a training run.
 
     Args:
-        folder: Folder of the run, as `runs/...`.
+        folder: Folder of the run, as `runs/...`, or a run that was published on the Hugging Face
+            Hub, as `hf://OWNER/NAME` or `hf://OWNER/NAME@REVISION`, which needs huggingface_hub.
         trust: Import and call objects outside this package, such as your own law, that the
             configuration names.
 
@@ -180,7 +186,28 @@ def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":
         ValueError: There is no finished run, its checkpoint belongs to another scene, or it names
             an object that is not trusted.
     """
-    return inference.Simulator(load_run(folder, trust=trust, keys=PREDICTION)[1])
+    with _local(str(folder)) as place:
+        return inference.Simulator(load_run(place, trust=trust, keys=PREDICTION)[1])
+
+
+@contextlib.contextmanager
+def _local(folder: str) -> Iterator[str]:
+    """Provide a folder on this machine with the files of a run."""
+    if not folder.startswith(HUB):
+        yield folder
+        return
+    try:
+        import huggingface_hub as hub
+    except ImportError:
+        raise ConfigError(f"{folder} needs huggingface_hub: {install('hub')}") from None
+    name, _, revision = folder.removeprefix(HUB).partition("@")
+    try:
+        found = hub.snapshot_download(name, revision=revision or None, allow_patterns=SHARED)
+    except (OSError, ValueError, hub.errors.HfHubHTTPError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ConfigError(f"{folder} cannot be downloaded: {reason}") from error
+    with tempfile.TemporaryDirectory() as copy:  # the cache consists of links, which runs refuse
+        yield shutil.copytree(found, Path(copy) / "run")
 
 
 def load_runs(

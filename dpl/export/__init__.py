@@ -10,5 +10,6 @@ if TYPE_CHECKING:
     from dpl.export.onnx_graph import ExportGraph, OnnxSession, export_onnx, onnx_opset
     from dpl.export.paraview import write_results
     from dpl.export.runtime import write_runtime
+    from dpl.export.shared import write_pairs, write_published
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)
