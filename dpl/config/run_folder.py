@@ -191,7 +191,7 @@ def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":
 
 
 @contextlib.contextmanager
-def _local(folder: str) -> Iterator[str]:
+def _local(folder: str) -> Iterator[str | Path]:
     """Provide a folder on this machine with the files of a run."""
     if not folder.startswith(HUB):
         yield folder

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from scipy.optimize import minimize_scalar
@@ -188,7 +188,7 @@ def fit_law(body: Problem, force: Tensor, displacement: Tensor) -> LawFit:
         return _fit_modulus(body, force, displacement)
 
     def fit(poisson: float) -> LawFit:
-        law = replace(body.material, poisson=poisson)  # type: ignore[call-arg]
+        law = replace(cast(Any, body.material), poisson=poisson)
         return _fit_modulus(replace(body, material=law), force, displacement, poisson)
 
     found = minimize_scalar(lambda x: fit(float(x)).residual, bounds=POISSON, method="bounded")
