@@ -119,8 +119,7 @@ class PairData(DataModule):
             f"path = {self._path}: {len(self._usable)} of {len(self.residuals)} pairs are "
             f"equilibria of this law, more than {needed} are needed; the median residual is "
             f"{float(self.residuals.median()):.2g} and tol = {self._tol:g}, supports move in "
-            f"{moved} pairs; the residual of the first pairs is smallest, {fit.residual:.2g}, "
-            f"with {best}"
+            f"{moved} pairs; {best} fit the first pairs best, to a residual of {fit.residual:.2g}"
         )
 
     def describe(self) -> list[tuple[str, str]]:

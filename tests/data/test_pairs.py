@@ -94,7 +94,7 @@ BAD = {
     "nan.npz": ({"force": np.nan, "displacement": 1}, "must be finite"),
     "double.npz": (
         {"force": 2, "displacement": 1},
-        "smallest, .*young = 9000 and poisson",
+        "young = 9000 and poisson = .* fit the first pairs",
     ),
     "moves.npz": ({"force": 1, "displacement": "moved"}, "supports move in 12 pairs"),
     "far.npz": ({"force": 1, "displacement": 1, "points": 3}, "has no point at .* nodes"),

@@ -499,7 +499,7 @@ def test_a_file_is_identified_by_its_forces(linear, path, tmp_path):
     copy, other = tmp_path / "copy.npz", tmp_path / "other.npy"
     np.savez(copy, forces=np.load(path))
     np.save(other, np.load(path)[:2])
-    one, same, less = (fem.FileLoads(linear, str(p), young=4500.0) for p in (path, copy, other))
+    one, same, less = (fem.FileLoads(linear, p, young=4500.0) for p in (path, copy, other))
     assert one.identity() == same.identity() != less.identity()
     assert fem.FileLoads(body(young=9000.0), path, young=9000.0).identity() != one.identity()
 

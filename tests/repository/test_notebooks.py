@@ -15,9 +15,9 @@ SECONDS = 300  # for one cell, where everything has to be compiled first
 every = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
-def test_there_are_seven_and_the_index_names_each():
+def test_there_are_eight_and_the_index_names_each():
     index = (ROOT / "notebooks" / "README.md").read_text()
-    assert [path.name[:2] for path in NOTEBOOKS] == [f"{k}_" for k in range(1, 8)]
+    assert [path.name[:2] for path in NOTEBOOKS] == [f"{k}_" for k in range(1, 9)]
     assert [path.name for path in NOTEBOOKS if f"({path.name})" not in index] == []
 
 

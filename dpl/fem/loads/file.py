@@ -45,6 +45,7 @@ class FileLoads(CombinedLoads):
     scale: float = 1.0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "path", str(self.path))  # plain data
         super().__post_init__()
         self.shapes  # noqa: B018  # raises if the file cannot be used
 
