@@ -4,7 +4,6 @@ import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import KW_ONLY, dataclass, field
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,23 +12,6 @@ from dpl.data.samples import transform
 from dpl.data.stream import SampleStream
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.scene import Sample, stack
-
-
-class StreamRates(NamedTuple):
-    """Rates of production and use of samples in one epoch.
-
-    Attributes:
-        produced, consumed: Samples per second.
-        waiting: Fraction of the time in which training waited for samples.
-        uses: Mean number of uses of the samples produced so far.
-        buffer: Number of samples in the buffer.
-    """
-
-    produced: float
-    consumed: float
-    waiting: float
-    uses: float
-    buffer: int
 
 
 @dataclass(eq=False)
@@ -45,15 +27,14 @@ class ReplayBuffer:
     Attributes:
         stream: Source of the samples.
         batch_size: Samples in a batch.
-        batches: Batches in a pass.
-        new_per_round: New samples per round.
-        reuse: Maximum number of uses of a sample.
-        capacity: Number of samples that the buffer keeps.
+        batches, new_per_round, reuse, capacity: See `dpl.data.Stream`.
         seed: Seed of the choice of samples and images.
         group: Symmetries of the body, identity first: each use is that of a random image.
         produced: Number of samples taken from the stream so far.
         next_index: Upper bound of the numbers of these loads, plus one.
-        rates: Rates of the last epoch; None before its end.
+        rates: `produced` samples per second of the last epoch, fraction of its time `waiting` for
+            samples, mean number of `uses` of a sample so far, samples in the `buffer`; None before
+            its end.
     """
 
     stream: SampleStream
@@ -67,7 +48,7 @@ class ReplayBuffer:
     group: SymmetryGroup = NO_SYMMETRIES
     produced: int = field(default=0, init=False)
     next_index: int = field(default=0, init=False)
-    rates: StreamRates | None = field(default=None, init=False)
+    rates: dict[str, float] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self._buffer = _Buffer(self.capacity, self.reuse)
@@ -82,18 +63,16 @@ class ReplayBuffer:
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield the batches of one epoch."""
-        start, produced, used, waited = time.monotonic(), self.produced, self._used, self._waited
+        start, produced, waited = time.monotonic(), self.produced, self._waited
         for k, batch in enumerate(itertools.islice(self._batches, self.batches), 1):
             if k == self.batches:  # before the last batch, after which no code of this loop runs
-                used += self.batch_size if k > 1 else 0  # the last batch is not used yet
                 seconds = max(time.monotonic() - start, 1e-9)
-                self.rates = StreamRates(
-                    produced=(self.produced - produced) / seconds,
-                    consumed=(self._used - used) / seconds,
-                    waiting=(self._waited - waited) / seconds,
-                    uses=self._used / max(self.produced, 1),
-                    buffer=self._buffer.size,
-                )
+                self.rates = {
+                    "produced": (self.produced - produced) / seconds,
+                    "waiting": (self._waited - waited) / seconds,
+                    "uses": self._used / max(self.produced, 1),
+                    "buffer": float(self._buffer.size),
+                }
             yield batch
 
     @property
