@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import KW_ONLY, dataclass, field
 
 import torch
-from torch import Tensor
 
 from dpl.data.samples import transform
 from dpl.data.stream import SampleStream
@@ -51,7 +50,8 @@ class ReplayBuffer:
     rates: dict[str, float] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        self._buffer = _Buffer(self.capacity, self.reuse)
+        self._samples: list[Sample] = []
+        self._uses_left = torch.zeros(self.capacity, dtype=torch.int64)
         self._batches = self._draw()
         self._generator = torch.Generator().manual_seed(self.seed)
         self._used = 0
@@ -71,7 +71,7 @@ class ReplayBuffer:
                     "produced": (self.produced - produced) / seconds,
                     "waiting": (self._waited - waited) / seconds,
                     "uses": self._used / max(self.produced, 1),
-                    "buffer": float(self._buffer.size),
+                    "buffer": float(len(self._samples)),
                 }
             yield batch
 
@@ -94,19 +94,30 @@ class ReplayBuffer:
         samples = iter(self.stream)
         budget = 0.0  # uses that the samples so far allow
         while new := self._next_samples(samples):
-            uses = self.reuse if self._buffer.size == self.capacity else max(1.0, self.reuse / 2)
-            budget += len(new) * uses
-            self._buffer.put(new)
-            while budget >= self.batch_size and self._buffer.uses_left >= self.batch_size:
+            is_full = len(self._samples) == self.capacity
+            budget += len(new) * (self.reuse if is_full else max(1.0, self.reuse / 2))
+            for number, sample in enumerate(new, self.produced - len(new)):
+                place = number % self.capacity
+                self._samples[place : place + 1] = [sample]  # appends while the buffer fills
+                self._uses_left[place] = self.reuse
+            while budget >= self.batch_size and self._uses_left.sum() >= self.batch_size:
                 budget -= self.batch_size
-                chosen = self._buffer.choose(self.batch_size, self._generator)
                 self._used += self.batch_size
-                batch = Sample(*(column[chosen] for column in self._buffer.sample))
+                batch = stack([self._samples[place] for place in self._choose()])
                 if self.group:
                     shape = (self.batch_size,)
                     which = torch.randint(len(self.group), shape, generator=self._generator)
                     batch = transform(batch, self.group, which)
                 yield batch
+
+    def _choose(self) -> list[int]:
+        """Return the places of samples for a batch, distinct if there are enough."""
+        usable = self._uses_left.nonzero()[:, 0]
+        if len(usable) < self.batch_size:
+            usable = torch.repeat_interleave(usable, self._uses_left[usable])
+        chosen = usable[torch.randperm(len(usable), generator=self._generator)[: self.batch_size]]
+        self._uses_left -= torch.bincount(chosen, minlength=self.capacity)
+        return list(chosen.tolist())
 
     def _next_samples(self, samples: Iterator[tuple[int, Sample]]) -> list[Sample]:
         """Return the samples of a round; fewer at the end of a finite stream."""
@@ -116,44 +127,3 @@ class ReplayBuffer:
         self.produced += len(drawn)
         self.next_index = drawn[-1][0] + 1 if drawn else self.next_index
         return [sample for _, sample in drawn]
-
-
-class _Buffer:
-    """The last samples of a stream, each with the number of uses left."""
-
-    def __init__(self, capacity: int, reuse: int) -> None:
-        self._capacity = capacity
-        self._reuse = reuse
-        self._count = 0
-        self._uses_left = torch.zeros(capacity, dtype=torch.int64)
-        self.sample = Sample(*(torch.zeros(0) for _ in Sample._fields))
-
-    @property
-    def size(self) -> int:
-        """Number of samples."""
-        return min(self._count, self._capacity)
-
-    @property
-    def uses_left(self) -> int:
-        """Total number of uses left."""
-        return int(self._uses_left.sum())
-
-    def put(self, new: list[Sample]) -> None:
-        """Replace the oldest samples by new ones."""
-        columns = stack(new)
-        if not self._count:  # the system provides memory when it is first written
-            self.sample = Sample(*(c.new_empty(self._capacity, *c.shape[1:]) for c in columns))
-        rows = torch.arange(self._count, self._count + len(new)) % self._capacity
-        for column, values in zip(self.sample, columns, strict=True):
-            column[rows] = values
-        self._uses_left[rows] = self._reuse
-        self._count += len(new)
-
-    def choose(self, count: int, generator: torch.Generator) -> Tensor:
-        """Return rows of samples for a batch, distinct if there are enough, (B,)."""
-        usable = self._uses_left.nonzero()[:, 0]
-        if len(usable) < count:
-            usable = torch.repeat_interleave(usable, self._uses_left[usable])
-        chosen = usable[torch.randperm(len(usable), generator=generator)[:count]]
-        self._uses_left -= torch.bincount(chosen, minlength=self._capacity)
-        return chosen

@@ -175,7 +175,7 @@ def test_a_stream_yields_images_under_symmetries(online, scene):
     module = online(symmetry=True, batch_size=12, new_per_round=12, batches=4, capacity=1000)
     assert [line for line in module.skipped_work() if "samples of each load" in line]
     batches = list(module.train_dataloader())
-    own = set(forces([module.source._replay._buffer.sample]))
+    own = set(drawn(scene, module.source._replay.produced))
     assert len(set(forces(batches)) - own) > 24, "seven of eight are images"
     for batch in batches:
         ratio = scene.problem.relative_residual(batch.displacement, batch.force)

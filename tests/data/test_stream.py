@@ -330,7 +330,6 @@ def test_memory_does_not_grow_beyond_the_buffer(replay):
 
     for _ in stream:
         pass
-    columns = [column.data_ptr() for column in stream._buffer.sample]
     for _ in range(20):
         list(stream)
     before = resident()
@@ -339,7 +338,6 @@ def test_memory_does_not_grow_beyond_the_buffer(replay):
             pass
     assert stream.produced > 6000
     assert resident() - before < 8, "MB; all that went through is 30 MB"
-    assert [column.data_ptr() for column in stream._buffer.sample] == columns
 
 
 # ------------------------------------------------------------------ rates
