@@ -136,7 +136,11 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         """Fit the bases of the network."""
         if stage == "fit" and self.predictor.lacks_bases:
             data = self.trainer.datamodule
-            self.predictor.fit_bases(data.snapshots(), data.group)
+            self.fit_bases(data.snapshots(), data.group)
+
+    def fit_bases(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> None:
+        """Fit the bases of a network that `HasBases` to samples (S, N, D) and their images."""
+        self.predictor.fit_bases(samples, group)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move the module, and the problem of the metrics to the same device.
