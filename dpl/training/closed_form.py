@@ -94,7 +94,7 @@ def fit(
                 curve = {name: found[f"val/{metric}"] for name, metric in OF_CURVE.items()}
                 print(data.source.record(sizes["train"], curve), flush=True)
                 numbers = {**errors, "epoch": step, "memory/process": resident_memory()}
-                points = {f"learning_curve/{m}": errors[f"val/{m}"] for m in OF_CURVE.values()}
+                points = {f"learning_curve/{m}": found[f"val/{m}"] for m in OF_CURVE.values()}
                 for logger in loggers:
                     logger.log_metrics(numbers, step=step)
                     logger.log_metrics(points, step=sizes["train"])
