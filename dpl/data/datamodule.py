@@ -45,20 +45,14 @@ class DataModule(L.LightningDataModule):
         workers: int = 2,
         timeout: float | None = 600.0,
     ) -> None:
-        """Check the arguments, those of `DataSet` and the following; nothing is read or solved.
+        """Check the arguments; nothing is read or solved.
 
         Args:
-            scene: Scene of the loads.
+            scene, val, test, folder, seed, workers, timeout: See `DataSet`.
             train: Source of the training samples; a number stands for `Stored`.
-            val: Number of loads to validate on.
-            test: Number of loads to test on.
-            folder: Folder of the data set.
-            seed: Seed of the loads.
             shuffle_seed: Seed of the choice and the order of the samples for the batches.
             batch_size: Samples in a batch.
             symmetry: Train also on the images of each sample under the symmetries of the body.
-            workers: Number of processes that solve, one core each; 0: solve in this process.
-            timeout: Time limit for a load [s]; None: no limit.
         """
         super().__init__()
         check_range(1, MAX_COUNT, val=val, test=test, batch_size=batch_size)

@@ -1,9 +1,10 @@
 """A data set with the sizes that are wanted, and its generation with progress and interruption."""
 
 import json
+import math
 import sys
 import time
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import torch
 from rich import progress
-from safetensors.torch import save
 
-from dpl.data.solving.solve import LoadKey, SolvedLoad
+from dpl.data.solving.background import Background
+from dpl.data.solving.solve import Guess, LoadKey, SolvedLoad
 from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
 from dpl.data.storage.acceptance import bias_warning
 from dpl.data.storage.integrity import repair, verify
 from dpl.data.storage.journal import Session
-from dpl.data.storage.store import FORMAT, MODES, Store, blocks
+from dpl.data.storage.store import FORMAT, STREAMS, Store, blocks
 from dpl.scene import Scene
 from dpl.system.checks import check_range
 from dpl.system.files import exclusive_lock, write_file
@@ -27,6 +28,7 @@ from dpl.version import __version__
 
 MAX_LOADS = 10**7  # in a split
 MAX_WORKERS = 1024
+REFRESH = 0.5  # time between two updates of the progress bar [s]
 PARTIAL_FILE_AGE = 10.0  # age above which the writer of an unfinished file is taken for dead [s]
 
 
@@ -126,31 +128,16 @@ class DataSet:
 
     def _solve_with_progress(self, missing: Mapping[str, Sequence[int]]) -> None:
         """Solve these loads, by split, under a progress bar."""
-        columns = (
-            progress.TextColumn("solving loads"),
-            progress.BarColumn(),
-            progress.MofNCompleteColumn(),
-            progress.TextColumn("{task.fields[news]}"),
-            progress.TimeRemainingColumn(),
-        )
         total = sum(map(len, missing.values()))
-        if not total and not self.store.scattered(self.shard, self.shards):
-            return
-        session = Session(workers=self.workers)
-        with GracefulShutdown() as stop, progress.Progress(*columns, refresh_per_second=2) as bars:
-            bar = bars.add_task("", total=total, news="", visible=total > 0)
-            try:
+        if total or self.store.scattered(self.shard, self.shards):
+            with GracefulShutdown() as stop:
                 # closed first, which ends the workers
-                with closing(self.solve(missing.items(), stop)) as solving:
-                    for solved in solving:
-                        news = session.count(solved.accepted, solved.seconds)
-                        bars.update(bar, advance=1, news=news)
-            finally:
-                session.append_to_journal(self.store.folder)
-            stop.exit()
+                with closing(LoadSolver(self, missing.items(), stop=stop)) as solver:
+                    solver.finish(total)
+                stop.exit()
 
     def create(self) -> None:
-        """Write `scene.json` and the modes if they are missing.
+        """Write `scene.json` if it is missing.
 
         Raises:
             DataSetError: The folder holds something else.
@@ -159,7 +146,6 @@ class DataSet:
         if self.store.exists():
             return
         folder.mkdir(parents=True, exist_ok=True)
-        write_file(folder / MODES, save(dict(scene.loads.arrays())))
         card = {
             "format": FORMAT,
             "fingerprint": scene.fingerprint,
@@ -170,7 +156,10 @@ class DataSet:
         write_file(folder / "scene.json", json.dumps(card, indent=1).encode())
 
     def solve(
-        self, loads: Iterable[tuple[str, Sequence[int]]], stop: object = None
+        self,
+        loads: Iterable[tuple[str, Sequence[int]]],
+        stop: object = None,
+        guess: Guess | None = None,
     ) -> Generator[SolvedLoad, None, None]:
         """Solve loads that have not been tried; yield each as soon as it is solved.
 
@@ -180,6 +169,7 @@ class DataSet:
         Args:
             loads: Splits with numbers of loads, in the order of the solves; read when they are due.
             stop: Once its truth value is True, no further load is started.
+            guess: See `solve_loads`.
 
         Raises:
             DataSetError: The folder holds something else, or another process writes there.
@@ -210,13 +200,18 @@ class DataSet:
                     store.merge(*unmerged.pop(0)[:2])
 
             for solved in solve_loads(
-                self.scene, jobs(), workers=self.workers, timeout=self.timeout, stop=stop
+                self.scene,
+                jobs(),
+                workers=self.workers,
+                timeout=self.timeout,
+                stop=stop,
+                guess=guess,
             ):
                 store.write(solved)
                 tried.add(solved.job)
-                yield solved
                 merge_complete_blocks()
-            merge_complete_blocks()
+                yield solved
+            merge_complete_blocks()  # of loads that another session had tried
 
     def verify(self) -> Iterator[str]:
         """Yield one line for each flaw of the data set, and for missing loads.
@@ -224,8 +219,8 @@ class DataSet:
         Raises:
             DataSetError: There is no data set.
         """
-        files = len(self.store.files()) + 1
-        for path, flaw in progress.track(verify(self.store), "verifying files", total=files):
+        total = len(self.store.files())
+        for path, flaw in progress.track(verify(self.store), "verifying files", total=total):
             if flaw:
                 yield f"{path} {flaw}"
         for split, numbers in self.missing().items():
@@ -255,3 +250,101 @@ def remove_unfinished(folder: Path) -> None:
         with suppress(FileNotFoundError):
             if time.time() - path.stat().st_mtime > PARTIAL_FILE_AGE:
                 path.unlink()
+
+
+class LoadSolver:
+    """Solves loads of a data set under progress bars, by default in the caller's thread."""
+
+    def __init__(
+        self,
+        dataset: DataSet,
+        loads: Iterable[tuple[str, Sequence[int]]],
+        *,
+        guess: Guess | None = None,
+        stop: object = None,
+        thread: bool = False,
+    ) -> None:
+        """Start to solve.
+
+        Args:
+            dataset: The data set.
+            loads: Splits with numbers of loads, in the order of the solves; read when they are due.
+            guess: See `solve_loads`.
+            stop: See `solve_loads`.
+            thread: A thread supervises the workers and writes the solved loads meanwhile.
+        """
+        self._dataset, self._loads, self._guess = dataset, loads, guess
+        self._tried = {split: dataset.store.tried(split) for split in STREAMS}
+        self._first = dict.fromkeys(STREAMS, 0)  # all loads before these have been tried
+        self._session = Session(workers=dataset.workers)
+        self._news = ""
+        self._solved = Background(
+            lambda own: self._solve(own if stop is None else stop), thread=thread
+        )
+
+    def _solve(self, stop: object) -> Generator[LoadKey, None, None]:
+        store, session = self._dataset.store, self._session
+        splits = {store.stream(split): split for split in STREAMS}
+        try:
+            with closing(self._dataset.solve(self._loads, stop, self._guess)) as solving:
+                for solved in solving:
+                    self._news = session.count(solved.accepted, solved.seconds)
+                    self._tried[splits[solved.job.seed]].add(solved.job.number)
+                    yield solved.job
+        finally:
+            session.append_to_journal(store.folder)
+
+    def count(self, split: str) -> int:
+        """Return the number of loads of a split before the first one that has not been tried."""
+        while self._first[split] in self._tried[split]:
+            self._first[split] += 1
+        return self._first[split]
+
+    def wait(
+        self, sizes: Mapping[str, int], *, until: float | None = None, show: bool = False
+    ) -> None:
+        """Wait until the first loads of each split have been tried, or there is no load left.
+
+        Args:
+            sizes: Number of loads, by split.
+            until: Time of `time.monotonic` at which the wait ends [s]; None: no limit.
+            show: Show a progress bar.
+
+        Raises:
+            DataSetError: The folder holds something else, or another process writes there.
+            RuntimeError: Workers die repeatedly.
+        """
+
+        def done() -> int:
+            return sum(min(self.count(split), size) for split, size in sizes.items())
+
+        self._wait(done, sum(sizes.values()), until=until, show=show)
+
+    def finish(self, total: int) -> None:
+        """Solve all loads, `total` in number, and merge files; errors are those of `wait`."""
+        self._wait(lambda: self._session.loads, total or 1, show=total > 0)
+        self._solved.get()  # merges the last files
+
+    def _wait(
+        self, done: Callable[[], int], wanted: int, *, until: float | None = None, show: bool
+    ) -> None:
+        with progress.Progress(
+            progress.TextColumn("solving loads"),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TextColumn("{task.fields[news]}"),
+            progress.TimeRemainingColumn(),
+            refresh_per_second=2,
+            disable=not show,
+        ) as bars:
+            bar = bars.add_task("", total=wanted, news="")
+            while True:
+                bars.update(bar, completed=(count := done()), news=self._news)
+                left = math.inf if until is None else until - time.monotonic()
+                if count >= wanted or self._solved.ended or left <= 0:
+                    return
+                self._solved.get(min(REFRESH, left))
+
+    def close(self) -> None:
+        """Finish the solves in progress, start no other and end the workers."""
+        self._solved.close()

@@ -5,17 +5,17 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from dpl.data.background import BackgroundSolver
-from dpl.data.dataset import MAX_LOADS, DataSet
+from dpl.data.dataset import MAX_LOADS, DataSet, LoadSolver
 from dpl.data.learning_curve import CurvePoint, describe, loads_for
-from dpl.data.sources import Source
+from dpl.data.solving.solve import Guess
+from dpl.data.sources import Source, fit_sizes
 from dpl.data.storage.store import SHARD_SIZE, Store
+from dpl.scene import Sample
 from dpl.system.checks import check_range
 from dpl.system.threads import leave_cores
 
 PATIENCE = 2  # fits without gain after which the growth ends
 MIN_GAIN = 0.95  # ratio of errors from which a fit is one without gain
-HELD_OUT = 32  # smallest number of held-out loads, as far as there are as many
 # ratio of the training loads of a fit to those of the one before
 MIN_FACTOR = math.sqrt(2)
 MAX_FACTOR = 4
@@ -26,7 +26,9 @@ class Growing(Source):
 
     After the first `SHARD_SIZE` training loads the model is fitted and its error on held-out loads
     recorded. The next fit takes `MIN_FACTOR` times as many loads, or more if they are solved
-    already, but not more than the learning curve predicts for the error wanted.
+    already, but not more than the learning curve predicts for the error wanted. The errors of a fit
+    are those of the next training loads: held-out loads that have chosen its ridges and modes give
+    smaller ones.
 
     The loads are those of the data set of the same seed, in the same order.
 
@@ -51,7 +53,6 @@ class Growing(Source):
         check_range(1, MAX_LOADS, max_train=max_train)
         self.points: list[CurvePoint] = []
         self._error, self._minutes, self._max_train = error, minutes, max_train
-        self._solver: BackgroundSolver | None = None
         self._start = self._fit_start = time.monotonic()
         self._fit_seconds = 0.0  # duration of the last fit
 
@@ -61,7 +62,7 @@ class Growing(Source):
         """Return the number of training loads of the last fit, or of those that are there."""
         return self.points[-1].loads if self.points else len(store.tried("train"))
 
-    def fits(self, dataset: DataSet) -> Iterator[dict[str, int]]:
+    def fits(self, dataset: DataSet, guess: Guess | None = None) -> Iterator[dict[str, int]]:
         """Solve loads in the background; yield the numbers of training and held-out loads of fits.
 
         The errors of each fit have to be recorded before the next one. The loads of validation and
@@ -69,6 +70,7 @@ class Growing(Source):
 
         Args:
             dataset: The data set; its numbers of validation and test loads are those wanted.
+            guess: See `Source.fits`.
 
         Raises:
             DataSetError: The folder holds something else, or another process writes there.
@@ -78,7 +80,8 @@ class Growing(Source):
             return
         leave_cores(dataset.workers)
         self._start = time.monotonic() - (self.points[-1].seconds if self.points else 0.0)
-        self._solver = BackgroundSolver(dataset, self._loads(dataset))
+        loads, thread = self._loads(dataset), dataset.workers > 0
+        self._solver = LoadSolver(dataset, loads, guess=guess, thread=thread)
         while not self.is_finished:
             yield self._next_sizes(self._solver, dataset.val)
         self._solver.wait({"val": dataset.val, "test": dataset.test}, show=True)
@@ -90,23 +93,24 @@ class Growing(Source):
             if self.is_finished:
                 break
             end = min(train + SHARD_SIZE, self._max_train)
-            yield "val", range(val, _held_out(end, dataset.val))
+            held_out = fit_sizes(end, dataset.val)["val"]
+            yield "val", range(val, held_out)
             yield "train", range(train, end)
-            val = _held_out(end, dataset.val)
+            val = held_out
         yield "val", range(val, dataset.val)
         yield "test", range(dataset.test)
 
-    def _next_sizes(self, solver: BackgroundSolver, val: int) -> dict[str, int]:
+    def _next_sizes(self, solver: LoadSolver, val: int) -> dict[str, int]:
         """Wait for the loads of the next fit; return the numbers of training and held-out loads."""
         least, most = self._limits()
-        solver.wait(_sizes(least, val), until=self._deadline(), show=not self.points)
+        solver.wait(fit_sizes(least, val), until=self._deadline(), show=not self.points)
         self._fit_start = time.monotonic()
         available = solver.count("train")
-        while available and solver.count("val") < _held_out(available, val):
+        while available and solver.count("val") < fit_sizes(available, val)["val"]:
             available = max(0, available - SHARD_SIZE)
         if available < least:  # the time is over
-            return _sizes(max(available, self.points[-1].loads if self.points else 1), val)
-        return _sizes(max(least, min(most, available // SHARD_SIZE * SHARD_SIZE)), val)
+            return fit_sizes(max(available, self.points[-1].loads if self.points else 1), val)
+        return fit_sizes(max(least, min(most, available // SHARD_SIZE * SHARD_SIZE)), val)
 
     def _limits(self) -> tuple[int, int]:
         """Return the smallest and the largest number of training loads of the next fit."""
@@ -129,6 +133,13 @@ class Growing(Source):
         return self._start + 60 * self._minutes - self._fit_seconds
 
     # ------------------------------------------------------------------ errors
+
+    def unseen(self, store: Store, loads: int) -> Sample | None:
+        """Return the training samples that follow those of a fit, None after the last ones."""
+        assert self._solver is not None  # there are fits while it solves
+        self._solver.wait({"train": loads + SHARD_SIZE}, until=self._deadline())
+        end = min(self._solver.count("train"), loads + SHARD_SIZE)
+        return store.load("train", end, first=loads) if end > loads else None
 
     def record(self, loads: int, errors: Mapping[str, float]) -> str:
         """Record the held-out errors of a fit.
@@ -171,14 +182,6 @@ class Growing(Source):
             return f"data.train.minutes = {self._minutes:g} reached"
         return ""
 
-    # ------------------------------------------------------------------ end
-
-    def close(self) -> None:
-        """Finish the solves in progress and end the workers."""
-        if self._solver is not None:
-            self._solver.close()
-            self._solver = None
-
     def state_dict(self) -> dict[str, Any]:
         """Return the learning curve as plain data."""
         return {"points": [list(point) for point in self.points]}
@@ -186,12 +189,3 @@ class Growing(Source):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue a learning curve."""
         self.points = [CurvePoint(int(n), *map(float, rest)) for n, *rest in state["points"]]
-
-
-def _held_out(train: int, val: int) -> int:
-    """Return the number of held-out loads, of `val`, for a number of training loads."""
-    return min(val, max(HELD_OUT, train // 2))
-
-
-def _sizes(train: int, val: int) -> dict[str, int]:
-    return {"train": train, "val": _held_out(train, val)}

@@ -4,32 +4,13 @@ import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import KW_ONLY, dataclass, field
-from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 from dpl.data.samples import transform
 from dpl.data.stream import SampleStream
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.scene import Sample, stack
-
-
-class StreamRates(NamedTuple):
-    """Rates of production and use of samples in one epoch.
-
-    Attributes:
-        produced, consumed: Samples per second.
-        waiting: Fraction of the time in which training waited for samples.
-        uses: Mean number of uses of the samples produced so far.
-        buffer: Number of samples in the buffer.
-    """
-
-    produced: float
-    consumed: float
-    waiting: float
-    uses: float
-    buffer: int
 
 
 @dataclass(eq=False)
@@ -45,15 +26,14 @@ class ReplayBuffer:
     Attributes:
         stream: Source of the samples.
         batch_size: Samples in a batch.
-        batches: Batches in a pass.
-        new_per_round: New samples per round.
-        reuse: Maximum number of uses of a sample.
-        capacity: Number of samples that the buffer keeps.
+        batches, new_per_round, reuse, capacity: See `dpl.data.Stream`.
         seed: Seed of the choice of samples and images.
         group: Symmetries of the body, identity first: each use is that of a random image.
         produced: Number of samples taken from the stream so far.
         next_index: Upper bound of the numbers of these loads, plus one.
-        rates: Rates of the last epoch; None before its end.
+        rates: `produced` samples per second of the last epoch, fraction of its time `waiting` for
+            samples, mean number of `uses` of a sample so far, samples in the `buffer`; None before
+            its end.
     """
 
     stream: SampleStream
@@ -67,10 +47,11 @@ class ReplayBuffer:
     group: SymmetryGroup = NO_SYMMETRIES
     produced: int = field(default=0, init=False)
     next_index: int = field(default=0, init=False)
-    rates: StreamRates | None = field(default=None, init=False)
+    rates: dict[str, float] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        self._buffer = _Buffer(self.capacity, self.reuse)
+        self._samples: list[Sample] = []
+        self._uses_left = torch.zeros(self.capacity, dtype=torch.int64)
         self._batches = self._draw()
         self._generator = torch.Generator().manual_seed(self.seed)
         self._used = 0
@@ -82,18 +63,16 @@ class ReplayBuffer:
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield the batches of one epoch."""
-        start, produced, used, waited = time.monotonic(), self.produced, self._used, self._waited
+        start, produced, waited = time.monotonic(), self.produced, self._waited
         for k, batch in enumerate(itertools.islice(self._batches, self.batches), 1):
             if k == self.batches:  # before the last batch, after which no code of this loop runs
-                used += self.batch_size if k > 1 else 0  # the last batch is not used yet
                 seconds = max(time.monotonic() - start, 1e-9)
-                self.rates = StreamRates(
-                    produced=(self.produced - produced) / seconds,
-                    consumed=(self._used - used) / seconds,
-                    waiting=(self._waited - waited) / seconds,
-                    uses=self._used / max(self.produced, 1),
-                    buffer=self._buffer.size,
-                )
+                self.rates = {
+                    "produced": (self.produced - produced) / seconds,
+                    "waiting": (self._waited - waited) / seconds,
+                    "uses": self._used / max(self.produced, 1),
+                    "buffer": float(len(self._samples)),
+                }
             yield batch
 
     @property
@@ -115,19 +94,30 @@ class ReplayBuffer:
         samples = iter(self.stream)
         budget = 0.0  # uses that the samples so far allow
         while new := self._next_samples(samples):
-            uses = self.reuse if self._buffer.size == self.capacity else max(1.0, self.reuse / 2)
-            budget += len(new) * uses
-            self._buffer.put(new)
-            while budget >= self.batch_size and self._buffer.uses_left >= self.batch_size:
+            is_full = len(self._samples) == self.capacity
+            budget += len(new) * (self.reuse if is_full else max(1.0, self.reuse / 2))
+            for number, sample in enumerate(new, self.produced - len(new)):
+                place = number % self.capacity
+                self._samples[place : place + 1] = [sample]  # appends while the buffer fills
+                self._uses_left[place] = self.reuse
+            while budget >= self.batch_size and self._uses_left.sum() >= self.batch_size:
                 budget -= self.batch_size
-                chosen = self._buffer.choose(self.batch_size, self._generator)
                 self._used += self.batch_size
-                batch = Sample(*(column[chosen] for column in self._buffer.sample))
+                batch = stack([self._samples[place] for place in self._choose()])
                 if self.group:
                     shape = (self.batch_size,)
                     which = torch.randint(len(self.group), shape, generator=self._generator)
                     batch = transform(batch, self.group, which)
                 yield batch
+
+    def _choose(self) -> list[int]:
+        """Return the places of samples for a batch, distinct if there are enough."""
+        usable = self._uses_left.nonzero()[:, 0]
+        if len(usable) < self.batch_size:
+            usable = torch.repeat_interleave(usable, self._uses_left[usable])
+        chosen = usable[torch.randperm(len(usable), generator=self._generator)[: self.batch_size]]
+        self._uses_left -= torch.bincount(chosen, minlength=self.capacity)
+        return list(chosen.tolist())
 
     def _next_samples(self, samples: Iterator[tuple[int, Sample]]) -> list[Sample]:
         """Return the samples of a round; fewer at the end of a finite stream."""
@@ -137,44 +127,3 @@ class ReplayBuffer:
         self.produced += len(drawn)
         self.next_index = drawn[-1][0] + 1 if drawn else self.next_index
         return [sample for _, sample in drawn]
-
-
-class _Buffer:
-    """The last samples of a stream, each with the number of uses left."""
-
-    def __init__(self, capacity: int, reuse: int) -> None:
-        self._capacity = capacity
-        self._reuse = reuse
-        self._count = 0
-        self._uses_left = torch.zeros(capacity, dtype=torch.int64)
-        self.sample = Sample(*(torch.zeros(0) for _ in Sample._fields))
-
-    @property
-    def size(self) -> int:
-        """Number of samples."""
-        return min(self._count, self._capacity)
-
-    @property
-    def uses_left(self) -> int:
-        """Total number of uses left."""
-        return int(self._uses_left.sum())
-
-    def put(self, new: list[Sample]) -> None:
-        """Replace the oldest samples by new ones."""
-        columns = stack(new)
-        if not self._count:  # the system provides memory when it is first written
-            self.sample = Sample(*(c.new_empty(self._capacity, *c.shape[1:]) for c in columns))
-        rows = torch.arange(self._count, self._count + len(new)) % self._capacity
-        for column, values in zip(self.sample, columns, strict=True):
-            column[rows] = values
-        self._uses_left[rows] = self._reuse
-        self._count += len(new)
-
-    def choose(self, count: int, generator: torch.Generator) -> Tensor:
-        """Return rows of samples for a batch, distinct if there are enough, (B,)."""
-        usable = self._uses_left.nonzero()[:, 0]
-        if len(usable) < count:
-            usable = torch.repeat_interleave(usable, self._uses_left[usable])
-        chosen = usable[torch.randperm(len(usable), generator=generator)[:count]]
-        self._uses_left -= torch.bincount(chosen, minlength=self._capacity)
-        return chosen

@@ -1,19 +1,23 @@
 """Sources of the training samples of a data module: a data set on disk, or an endless stream."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
-from dpl.data.dataset import DataSet
+from dpl.data.dataset import DataSet, LoadSolver
 from dpl.data.learning_curve import CurvePoint, in_words
-from dpl.data.replay_buffer import ReplayBuffer, StreamRates
-from dpl.data.storage.store import Store
+from dpl.data.replay_buffer import ReplayBuffer
+from dpl.data.solving.solve import Guess
+from dpl.data.storage.store import SHARD_SIZE, Store
 from dpl.data.stream import SampleStream
-from dpl.scene import Scene
+from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.memory import machine, refuse_beyond
-from dpl.system.threads import leave_cores
+from dpl.system.threads import leave_cores, one_thread
 
 MAX_COUNT = 10**9  # of batches, and of samples in a batch
+HELD_OUT = 32  # smallest number of held-out loads of a fit, as far as there are as many
+MIN_REST = 128  # training loads that are not solved for which a fit to the first ones saves time
 
 
 class Source:
@@ -22,12 +26,13 @@ class Source:
     Attributes:
         train: Number of training loads that are solved before a training.
         points: Learning curve of the fits so far of a model in closed form.
-        rates: Rates of a stream in the last epoch; None for other sources and before its end.
+        rates: See `ReplayBuffer`; None for other sources.
     """
 
     train: int = 0
     points: Sequence[CurvePoint] = ()
-    rates: StreamRates | None = None
+    rates: Mapping[str, float] | None = None
+    _solver: LoadSolver | None = None
 
     def check(self, scene: Scene, batch_size: int) -> None:
         """Raise an error if the source cannot serve this scene."""
@@ -40,22 +45,33 @@ class Source:
         """Return the batches of an epoch of gradient descent for a `DataModule`."""
         return data.shuffled()
 
-    def fits(self, dataset: DataSet) -> Iterator[dict[str, int]]:
+    def fits(self, dataset: DataSet, guess: Guess | None = None) -> Iterator[dict[str, int]]:
         """Yield the numbers of loads, by split, of each fit of a model in closed form.
+
+        Args:
+            dataset: The data set; its missing loads are solved.
+            guess: Prediction of the last fit, from which loads are solved.
 
         Raises:
             DataSetError: The folder holds something else, or another process writes there.
             KeyboardInterrupt: The solves were interrupted.
+            ValueError: The source is no set of solved loads.
         """
-        dataset.fill()
-        yield dataset.sizes
+        raise ValueError("a model in closed form is fitted to solved loads; set data=offline")
+
+    def unseen(self, store: Store, loads: int) -> Sample | None:
+        """Return samples that the fit to a number of training loads has not seen, if there are."""
+        return None
 
     def record(self, loads: int, errors: Mapping[str, float]) -> str:
         """Record the held-out errors of a fit to a number of loads; return them in words."""
         return f"{loads} loads: {in_words(errors)}"
 
     def close(self) -> None:
-        """End the worker processes."""
+        """Finish the solves in progress and end the worker processes."""
+        if self._solver is not None:
+            self._solver.close()
+            self._solver = None
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state that a resumed training needs, as plain data."""
@@ -65,40 +81,55 @@ class Source:
         """Continue from a state."""
 
 
+@dataclass(eq=False)
 class Stored(Source):
     """The first loads of a data set on disk; missing ones are solved before the training."""
 
-    def __init__(self, train: int = 1000) -> None:
-        """Take the number of training loads."""
-        self.train = train
+    train: int = 1000
 
+    def fits(self, dataset: DataSet, guess: Guess | None = None) -> Iterator[dict[str, int]]:
+        """Yield the sizes of the data set; before, if many loads are missing, those of a first fit.
 
-class Stream(Source):
-    """Samples that worker processes solve while the network trains, kept in a `ReplayBuffer`."""
-
-    def __init__(
-        self,
-        *,
-        batches: int = 16,
-        new_per_round: int = 8,
-        reuse: int = 50,
-        capacity: int = 4096,
-    ) -> None:
-        """Check the arguments.
-
-        Args:
-            batches: Batches in an epoch.
-            new_per_round: New samples after which batches are drawn again.
-            reuse: Maximum number of uses of a sample.
-            capacity: Number of samples that the replay buffer keeps.
+        The missing loads are then solved from its predictions, see `Source.fits`.
         """
-        check_range(1, MAX_COUNT, batches=batches, new_per_round=new_per_round, reuse=reuse)
-        if capacity < new_per_round:
+        first = fit_sizes(SHARD_SIZE, dataset.val)
+        if len(dataset.store.missing("train", dataset.train)) > MIN_REST:
+            rest = {part: range(first.get(part, 0), n) for part, n in dataset.sizes.items()}
+            loads = [*((part, range(n)) for part, n in first.items()), *rest.items()]
+            self._solver = LoadSolver(dataset, loads, guess=guess, thread=dataset.workers > 0)
+            self._solver.wait(first, show=True)
+            with one_thread():  # the workers need the other cores
+                yield first
+            self._solver.wait(dataset.sizes, show=True)
+            self.close()
+        dataset.fill()
+        yield dataset.sizes
+
+
+@dataclass(eq=False)
+class Stream(Source):
+    """Samples that worker processes solve while the network trains, kept in a `ReplayBuffer`.
+
+    Attributes:
+        batches: Batches in an epoch.
+        new_per_round: New samples after which batches are drawn again.
+        reuse: Maximum number of uses of a sample.
+        capacity: Number of samples that the replay buffer keeps.
+    """
+
+    _: KW_ONLY
+    batches: int = 16
+    new_per_round: int = 8
+    reuse: int = 50
+    capacity: int = 4096
+
+    def __post_init__(self) -> None:
+        counts = {name: getattr(self, name) for name in ("batches", "new_per_round", "reuse")}
+        check_range(1, MAX_COUNT, **counts)
+        if self.capacity < self.new_per_round:
             raise ValueError(
-                f"capacity = {capacity} must be at least new_per_round = {new_per_round}"
+                f"capacity = {self.capacity} must be at least new_per_round = {self.new_per_round}"
             )
-        self.batches, self.new_per_round = batches, new_per_round
-        self.reuse, self.capacity = reuse, capacity
         self._replay: ReplayBuffer | None = None
         self._first = 0  # number of loads of the run that this one resumes
 
@@ -119,8 +150,8 @@ class Stream(Source):
         refuse_beyond(needed, machine(), f"{self.capacity} samples", remedy)
 
     @property
-    def rates(self) -> StreamRates | None:  # type: ignore[override]
-        """Rates of the stream in the last epoch; None before its end."""
+    def rates(self) -> Mapping[str, float] | None:  # type: ignore[override]
+        """Rates of the stream in the last epoch, see `ReplayBuffer`."""
         return self._replay.rates if self._replay is not None else None
 
     def loader(self, data: Any) -> ReplayBuffer:
@@ -149,10 +180,6 @@ class Stream(Source):
         )
         return self._replay
 
-    def fits(self, dataset: DataSet) -> Iterator[dict[str, int]]:
-        """Raise ValueError: a stream is no set that a model could be fitted to."""
-        raise ValueError("a model in closed form is fitted to solved loads; set data=offline")
-
     def close(self) -> None:
         """Stop the workers."""
         if self._replay is not None:
@@ -166,3 +193,8 @@ class Stream(Source):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue a stream where it was left; no load is drawn twice."""
         self._first = state["next_index"]
+
+
+def fit_sizes(train: int, val: int) -> dict[str, int]:
+    """Return the numbers of held-out loads, of `val`, and of training loads of a fit, by split."""
+    return {"val": min(val, max(HELD_OUT, train // 2)), "train": train}

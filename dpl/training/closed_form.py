@@ -1,24 +1,29 @@
 """Training of a model in closed form: a fit for each number of loads of its data set."""
 
+import copy
 import math
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
 import lightning as L
 import torch
+from torch import Tensor
 
 from dpl.data.datamodule import DataModule
+from dpl.fem import Load
 from dpl.models.protocols import ClosedFormFit
+from dpl.scene import Sample
 from dpl.training import checkpoints
 from dpl.training.callbacks.tensorboard import LogHyperparameters
 from dpl.training.callbacks.throughput import TrainingTime, resident_memory
 from dpl.training.callbacks.worst_cases import WorstCasePlots
 from dpl.training.metrics import ErrorMetrics
+from dpl.training.predictors import Predictor
 from dpl.training.surrogate import Surrogate
 
 # metrics of a learning curve, by their names there
@@ -35,9 +40,10 @@ def fit(
 ) -> float:
     """Fit the network of a surrogate to the training samples, on the CPU.
 
-    `Stored` samples are fitted once. A source that is `Growing` repeats the fit with more loads.
-    After each fit its errors on the validation samples are printed, logged, and written with the
-    weights.
+    `Stored` samples are fitted once, or twice if many loads have to be solved. A source that is
+    `Growing` repeats the fit with more loads. After the first fit loads are solved from its
+    predictions. After each fit its errors on the validation samples are logged, and written with
+    the weights.
 
     Args:
         surrogate: The surrogate; its network is a `ClosedFormFit`.
@@ -65,27 +71,35 @@ def fit(
             if isinstance(one, OBSERVERS):
                 getattr(one, hook)(trainer, surrogate, *more)
 
+    last: Predictor | None = None  # as the last fit has left it
+
+    def guess(load: Load) -> Tensor | None:
+        return None if last is None else cast(Tensor, last(load))
+
     done = [point.e_mean for point in data.source.points]
     best, first, step = min(filter(math.isfinite, done), default=math.inf), len(done), None
     try:
         with _exit_on_sigterm():
-            for step, sizes in enumerate(data.source.fits(data.dataset), first):
+            for step, sizes in enumerate(data.source.fits(data.dataset, guess), first):
                 if step == first:
                     call("setup", "fit")
                     call("on_train_start")
                     call("on_train_epoch_start")
                 data.sizes |= sizes
                 net.fit(data.samples("train"), data.samples("val"))
-                errors = validation_errors(surrogate, data)
-                curve = {name: errors[f"val/{metric}"] for name, metric in OF_CURVE.items()}
+                last = _copy_for_solves(surrogate)
+                errors = found = errors_on(surrogate, data.val_dataloader())
+                if (unseen := data.source.unseen(data.store, sizes["train"])) is not None:
+                    found = errors_on(surrogate, [unseen])
+                curve = {name: found[f"val/{metric}"] for name, metric in OF_CURVE.items()}
                 print(data.source.record(sizes["train"], curve), flush=True)
                 numbers = {**errors, "epoch": step, "memory/process": resident_memory()}
-                points = {f"learning_curve/{m}": errors[f"val/{m}"] for m in OF_CURVE.values()}
+                points = {f"learning_curve/{m}": found[f"val/{m}"] for m in OF_CURVE.values()}
                 for logger in loggers:
                     logger.log_metrics(numbers, step=step)
                     logger.log_metrics(points, step=sizes["train"])
                     logger.save()
-                improved, best = curve["e_mean"] < best, min(best, curve["e_mean"])
+                improved, best = errors["val/e_mean"] < best, min(best, errors["val/e_mean"])
                 if folder is not None:
                     _write(surrogate, data, folder / "checkpoints", improved=improved)
                 call("on_validation_epoch_end")
@@ -99,12 +113,23 @@ def fit(
     return best
 
 
-def validation_errors(surrogate: Surrogate, data: DataModule) -> dict[str, float]:
-    """Return the metrics `val/NAME` and the mean loss `loss/val` on the validation samples."""
+def _copy_for_solves(surrogate: Surrogate) -> Predictor | None:
+    """Return a copy from which loads are solved while the model is fitted again.
+
+    None where Newton's method from rest is as fast, or the scene has another solver.
+    """
+    scene = surrogate.scene
+    if scene.newton is not scene.solver or not scene.is_compact:
+        return None
+    return copy.deepcopy(surrogate.predictor, {id(one): one for one in (scene, scene.problem)})
+
+
+def errors_on(surrogate: Surrogate, batches: Iterable[Sample]) -> dict[str, float]:
+    """Return the metrics `val/NAME` and the mean loss `loss/val` on samples."""
     metrics, loss, count = ErrorMetrics(surrogate.scene.problem), 0.0, 0
     surrogate.eval()
     with torch.no_grad():
-        for batch in data.val_dataloader():
+        for batch in batches:
             prediction, size = surrogate.predict(batch.load), len(batch.force)
             metrics.update(prediction, batch)
             loss += size * float(surrogate.loss(prediction, batch, surrogate.physics))

@@ -24,7 +24,6 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
 
     Attributes:
         loss: The loss.
-        physics: The part of the scene that losses need, on the device of the network.
     """
 
     if TYPE_CHECKING:  # type checkers do not follow Lightning
@@ -66,7 +65,6 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         self.loss = loss
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
-        self.physics = LossContext(scene.problem, self.largest_force)
         self.metrics = ErrorMetrics(scene.problem)
 
     @classmethod
@@ -83,6 +81,11 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         """Return a surrogate with `network(scene, inputs)`; the options are those of the class."""
         net = network(scene, Inputs.from_scene(scene, base, young=young))
         return cls(net, loss, scene, base=base, young=young, **options)
+
+    @property
+    def physics(self) -> LossContext:
+        """The part of the scene that losses need, on the device of the network."""
+        return LossContext(self.predictor.problem, self.largest_force)
 
     def describe(self) -> list[tuple[str, str]]:
         """Return name and size of the network, and the loss."""
@@ -140,13 +143,12 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         self.predictor.fit_bases(samples, group)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move the module, and the problem of the loss and of the metrics to the same device.
+        """Move the module, and the problem of the metrics to the same device.
 
         All ways to move a module end here. Lightning moves it after the hook `setup`.
         """
         super()._apply(fn, recurse)
         self.metrics.problem = self.predictor.problem
-        self.physics = LossContext(self.predictor.problem, self.largest_force)
         return self
 
     def configure_callbacks(self) -> list[L.Callback]:

@@ -4,7 +4,6 @@ import functools
 import itertools
 from types import SimpleNamespace
 
-import lightning as L
 import numpy as np
 import pytest
 import torch
@@ -13,8 +12,6 @@ from dpl import Sample
 from dpl.data import DataModule, Stream
 from dpl.data.solving.solve import solve_load
 from dpl.fem import symmetries
-from dpl.models import FCNN
-from dpl.training import MSE, Surrogate
 
 SIZES = {"val": 4, "test": 4, "workers": 0, "batch_size": 4}
 STREAM = {"batches": 3, "new_per_round": 4, "reuse": 1, "capacity": 64}
@@ -123,19 +120,6 @@ def test_a_batch_is_a_copy(offline):
     assert torch.equal(module.samples("train").force, before)
 
 
-def test_preparing_twice_solves_nothing(offline, folder, monkeypatch):
-    def written():
-        return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-    module, before, solved = offline(), written(), []
-    monkeypatch.setattr(
-        "dpl.data.solving.worker_pool.solve_load", lambda *_, **__: solved.append(1)
-    )
-    module.prepare_data()
-    assert solved == []
-    assert written() == before != {}
-
-
 # ------------------------------------------------------------------ symmetry
 
 
@@ -191,7 +175,7 @@ def test_a_stream_yields_images_under_symmetries(online, scene):
     module = online(symmetry=True, batch_size=12, new_per_round=12, batches=4, capacity=1000)
     assert [line for line in module.skipped_work() if "samples of each load" in line]
     batches = list(module.train_dataloader())
-    own = set(forces([module.source._replay._buffer.sample]))
+    own = set(drawn(scene, module.source._replay.produced))
     assert len(set(forces(batches)) - own) > 24, "seven of eight are images"
     for batch in batches:
         ratio = scene.problem.relative_residual(batch.displacement, batch.force)
@@ -261,7 +245,7 @@ def test_the_stream_validates_on_the_data_set(online, offline):
 def test_a_stream_writes_no_training_load(online, tmp_path, monkeypatch):
     seen = []
 
-    def counted(scene, job):
+    def counted(scene, job, guess=None):
         seen.append(job.seed)
         return solve_load(scene, job)
 
@@ -291,7 +275,7 @@ def test_a_resumed_stream_continues_with_the_next_load(online):
 
 
 def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, monkeypatch):
-    def choosy(scene, job):
+    def choosy(scene, job, guess=None):
         return solve_load(scene, job)._replace(accepted=job.number % 3 == 1)
 
     monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", choosy)
@@ -303,7 +287,7 @@ def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, mo
 
 
 def test_rejected_loads_with_nan_do_not_reach_training(online, monkeypatch):
-    def choosy(scene, job):
+    def choosy(scene, job, guess=None):
         one = solve_load(scene, job)
         bad = one._replace(accepted=False, reason="x", displacement=np.nan * one.displacement)
         return bad if job.number % 2 else one
@@ -311,40 +295,6 @@ def test_rejected_loads_with_nan_do_not_reach_training(online, monkeypatch):
     monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", choosy)
     for batch in online().train_dataloader():
         assert all(torch.isfinite(column).all() for column in batch)
-
-
-# ------------------------------------------------------------------ within a trainer
-
-
-@pytest.fixture
-def fitted(scene):
-    """Return a function that trains on a stream and returns the trainer."""
-
-    def fitted(module, epochs=2):
-        torch.manual_seed(0)
-        trainer = L.Trainer(
-            accelerator="cpu", max_epochs=epochs, logger=False, num_sanity_val_steps=0,
-            enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
-        )  # fmt: skip
-        trainer.fit(Surrogate(FCNN(scene, width=4), MSE(), scene), datamodule=module)
-        return trainer
-
-    return fitted
-
-
-def test_the_rates_of_an_epoch_are_there_at_its_end(online):
-    module = online(reuse=2)
-    assert module.source.rates is None
-    list(module.train_dataloader())
-    assert module.source.rates.uses == pytest.approx(12 / 12)
-    assert module.source.rates.buffer == 12
-
-
-def test_training_takes_no_more_samples_than_it_uses(online, fitted):
-    module = online()
-    trainer = fitted(module, epochs=2)
-    assert trainer.global_step == 6
-    assert module.state_dict() == {"next_index": 24}
 
 
 def test_a_stream_does_not_raise_the_number_of_threads(online):

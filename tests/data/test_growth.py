@@ -7,8 +7,8 @@ import pytest
 import torch
 from set_files import content
 
-from dpl.data import DataModule, DataSet, Growing, background, growing
-from dpl.data.background import BackgroundSolver
+from dpl.data import DataModule, DataSet, Growing, Stored, dataset, growing, sources
+from dpl.data.dataset import LoadSolver
 from dpl.data.storage import store as store_module
 from dpl.system.files import DataSetError, exclusive_lock
 
@@ -18,9 +18,9 @@ BLOCK = 4
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Fits begin with four loads; the number of threads, which growth changes, is restored."""
-    for module in (growing, store_module):
+    for module in (growing, sources, store_module):
         monkeypatch.setattr(module, "SHARD_SIZE", BLOCK)
-    monkeypatch.setattr(growing, "HELD_OUT", 2)
+    monkeypatch.setattr(sources, "HELD_OUT", 2)
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
@@ -149,13 +149,51 @@ def test_a_set_that_grew_is_read_as_a_whole_by_later_commands(module):
     assert len(later.snapshots().force) == 8
 
 
+def test_the_errors_of_a_fit_are_those_of_the_loads_that_follow(module):
+    data = module(max_train=10)
+    unseen = []
+    for error in (1.0, 0.9, 0.8):
+        step(data, error)
+        unseen.append(data.source.unseen(data.store, data.sizes["train"]))
+    whole = data.store.load("train", 10).force
+    assert torch.equal(unseen[0].force, whole[4:8])
+    assert torch.equal(unseen[1].force, whole[8:10])
+    assert unseen[2] is None, "there is no load after the last one"
+
+
+# ------------------------------------------------------------------ sets of a given size
+
+
+@pytest.mark.parametrize(("there", "fits"), [(0, [4, 16]), (10, [4, 16]), (12, [16])])
+def test_a_model_is_fitted_to_the_first_loads_if_many_are_missing(
+    scene, tmp_path, monkeypatch, there, fits
+):
+    monkeypatch.setattr(sources, "MIN_REST", 5)
+    sizes = {"val": 3, "test": 2, "workers": 0, "folder": str(tmp_path / "d")}
+    DataSet(scene, **sizes | {"train": there}).fill()
+    source, guesses = Stored(16), []
+
+    def guess(load):
+        guesses.append(load)
+
+    found = []
+    for size in source.fits(DataSet(scene, train=16, **sizes), guess):
+        found.append((size["train"], size["val"], len(guesses)))
+    source.close()
+    assert [train for train, *_ in found] == fits
+    assert [val for _, val, _ in found] == [2, 3][-len(fits) :]
+    assert found[-1][2] == (16 - there if len(fits) > 1 else 0)
+    alone = DataSet(scene, train=16, **sizes | {"folder": str(tmp_path / "e")}).fill()
+    assert content(tmp_path / "d") == content(alone.folder)
+
+
 # ------------------------------------------------------------------ in the background
 
 
 def test_a_worker_solves_in_the_background(scene, tmp_path):
     data = DataSet(scene, str(tmp_path / "d"), train=6, val=2, test=0, workers=1)
     before = multiprocessing.active_children()
-    solver = BackgroundSolver(data, [("val", range(2)), ("train", range(6))])
+    solver = LoadSolver(data, [("val", range(2)), ("train", range(6))], thread=True)
     solver.wait({"train": 3, "val": 2})
     assert solver.count("train") >= 3
     assert len(data.store.load("train", 3).force) == 3, "also loads whose files are not merged"
@@ -170,7 +208,7 @@ def test_a_worker_solves_in_the_background(scene, tmp_path):
 
 def test_a_closed_solver_starts_no_load(scene, tmp_path):
     data = DataSet(scene, str(tmp_path / "d"), train=10**6, val=0, test=0, workers=1)
-    solver = BackgroundSolver(data, (("train", range(k, k + 1)) for k in range(10**6)))
+    solver = LoadSolver(data, (("train", range(k, k + 1)) for k in range(10**6)), thread=True)
     solver.wait({"train": 1})
     solver.close()
     assert solver.count("train") < 10**6
@@ -181,7 +219,7 @@ def test_an_error_of_the_solver_is_raised_where_it_is_waited_for(scene, tmp_path
     data = DataSet(scene, str(tmp_path / "d"), workers=workers)
     data.create()
     with exclusive_lock(data.store.folder, 0, 1):
-        solver = BackgroundSolver(data, [("train", range(6))])
+        solver = LoadSolver(data, [("train", range(6))], thread=workers > 0)
         with pytest.raises(DataSetError):
             solver.wait({"train": 1})
         solver.close()
@@ -189,9 +227,9 @@ def test_an_error_of_the_solver_is_raised_where_it_is_waited_for(scene, tmp_path
 
 def test_a_wait_ends_at_its_time(scene, tmp_path, monkeypatch):
     data = DataSet(scene, str(tmp_path / "d"), workers=0)
-    solver = BackgroundSolver(data, [("train", range(6))])
+    solver = LoadSolver(data, [("train", range(6))])
     ticks = iter([0.0, 1.0, 2.0, 3.0])
-    monkeypatch.setattr(background.time, "monotonic", lambda: next(ticks))
+    monkeypatch.setattr(dataset.time, "monotonic", lambda: next(ticks))
     solver.wait({"train": 6}, until=2.0)
     assert solver.count("train") == 2
     solver.close()

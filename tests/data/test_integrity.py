@@ -6,11 +6,11 @@ from functools import partial
 
 import pytest
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file
 from set_files import content, falsify, flaws
 
 from dpl.data import DataSet, DataSetError
-from dpl.data.storage.integrity import check_modes, repair
+from dpl.data.storage.integrity import repair
 
 SIZES = {"train": 12, "val": 4, "test": 4}
 FIRST = "train-000000.safetensors"
@@ -130,25 +130,27 @@ def test_repair_also_solves_damaged_loads_beyond_the_sizes_wanted(copy, data):
     assert content(copy.folder) == content(data.store.folder)
 
 
-@pytest.mark.parametrize("harm", ["a copy", "no shard", "a link", "larger than any shard", "mine"])
+@pytest.mark.parametrize("harm", ["a copy", "no shard", "a link", "larger than any shard"])
 def test_a_file_that_is_no_shard_of_its_name_is_found_and_removed(copy, data, harm):
-    name = "mine" if harm == "mine" else "train-000064"
-    stray = copy.folder / f"{name}.safetensors"
-    if harm in ("a copy", "mine"):
+    stray = copy.folder / "train-000064.safetensors"
+    if harm == "a copy":
         shutil.copy(copy.folder / FIRST, stray)
     elif harm == "a link":
         stray.symlink_to(copy.folder / FIRST)
     else:
         stray.write_bytes(b"nothing" if harm == "no shard" else bytes(copy.max_shard_size(64) + 1))
     (copy.folder / ".val-000004.safetensors.99.part").write_bytes(b"half a shard")
-    (copy.folder / "notes.txt").write_text("mine")
+    for name in ("notes.txt", "mine.safetensors"):
+        (copy.folder / name).write_text("mine")
     assert copy.missing("train", 70) == list(range(12, 70))
     assert len(copy.load("train", 70).force) == 12
     assert list(flaws(copy)) == [stray.name]
     ((path, reported),) = repair(copy)
     assert path == stray
     assert reported.endswith("; it is removed")
-    assert (copy.folder / "notes.txt").exists()
+    for name in ("notes.txt", "mine.safetensors"):
+        assert (copy.folder / name).read_text() == "mine"
+        (copy.folder / name).unlink()
     assert not list(copy.folder.glob(".*.part"))
     assert content(copy.folder) == content(data.store.folder)
 
@@ -189,7 +191,6 @@ def test_a_flipped_bit_that_only_the_digest_detects_is_found(copy, column):
     ("name", "harm"),
     [
         *(("scene.json", harm) for harm in ("a link", "huge", "a folder")),
-        *(("modes.safetensors", harm) for harm in ("a folder", "a link", "huge")),
         *((FIRST, harm) for harm in ("a pipe", "a loop", "huge", "a link", "a folder")),
     ],
 )
@@ -210,22 +211,5 @@ def test_irregular_files_are_not_read(copy, tmp_path, name, harm):
         assert "regular" in flaws(copy)[name] or "larger" in flaws(copy)[name]
         return
     with pytest.raises(DataSetError, match=name) as refusal:
-        copy.modes() if name == "modes.safetensors" else copy.load("train", 12)
+        copy.load("train", 12)
     assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize("which", ["values", "vectors"])
-def test_modes_are_compared_to_six_digits_with_their_signs(scene, which):
-    modes = scene.loads.arrays()
-    assert check_modes(scene, modes) == ""
-    for factor, equal in ((1 + 1e-9, True), (1 + 1e-4, False), (-1.0, False)):
-        found = check_modes(scene, {**modes, which: modes[which] * factor})
-        assert found == ("" if equal else "holds other modes than this scene has")
-    fewer = {name: array[:-1] for name, array in modes.items()}
-    assert check_modes(scene, fewer) == "holds other modes than this scene has"
-
-
-def test_modes_of_another_precision_are_found(copy):
-    path = copy.folder / "modes.safetensors"
-    path.write_bytes(save({name: column.float() for name, column in load_file(path).items()}))
-    assert list(flaws(copy)) == ["modes.safetensors"]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from dpl.data.solving import solve
 from dpl.data.solving.solve import LoadKey, failed_load, solve_load
-from dpl.fem import SaintVenantKirchhoff
+from dpl.fem import Load, Newton, SaintVenantKirchhoff
 
 SEED = (5, 0)
 CLOCK = "seconds"
@@ -46,6 +47,55 @@ def test_a_solution_does_not_depend_on_the_scene_object_its_size_and_stiffness(
     assert (
         content(solve_load(twin, jobs[3]))["force"] == content(solve_load(scene, jobs[3]))["force"]
     )
+
+
+@pytest.fixture
+def newton_starts(monkeypatch):
+    """The list of loads that Newton's method solves, extended by each solve."""
+    found, iterate = [], Newton.iterate
+
+    def counted(newton, load, **options):
+        found.append(load)
+        return iterate(newton, load, **options)
+
+    monkeypatch.setattr(Newton, "iterate", counted)
+    return found
+
+
+def test_a_load_is_solved_from_a_near_displacement_without_newton(scene, jobs, newton_starts):
+    rest = [solve_load(scene, job) for job in jobs]
+    del newton_starts[:]
+    for job, one in zip(jobs, rest, strict=True):
+        near = solve_load(scene, job, 1.02 * one.displacement)
+        size = np.linalg.norm(one.displacement)
+        assert np.linalg.norm(near.displacement - one.displacement) < 1e-6 * size
+        assert near.accepted
+        assert near.residual < scene.solver.tol
+        assert near.iterations > 0
+    assert not newton_starts
+
+
+@pytest.mark.parametrize("guess", ["far", "inverted", "nan", "unknown stability"])
+def test_a_load_without_a_useful_guess_is_solved_from_rest(scene, jobs, guess, monkeypatch):
+    rest = solve_load(scene, jobs[0])
+    noise = np.random.default_rng(0).standard_normal(rest.displacement.shape)
+    if guess == "unknown stability":
+        monkeypatch.setattr(solve, "MIN_RITZ_VALUE", np.inf)
+    fields = {"far": 30 * rest.displacement, "inverted": noise, "nan": np.nan * noise}
+    found = solve_load(scene, jobs[0], fields.get(guess, rest.displacement))
+    assert content(found) == content(rest)
+
+
+def test_the_solver_of_the_scene_decides_on_an_unstable_equilibrium(make_scene):
+    """Under axial pressure far above the critical one the straight column is unstable."""
+    column = make_scene(size=(16.0, 1.0, 1.0), nodes=(17, 3, 3), n_modes=1)
+    ends = column.problem.points[:, 0] == column.problem.points[:, 0].max()
+    force = torch.zeros(1, *column.problem.shape, dtype=torch.float64)
+    force[0, ends, 0] = -3e-5 / ends.sum()
+    load = Load(force, torch.ones(1).double())
+    straight = [state for state in column.newton.iterate(load)][-1]
+    assert not straight.stable
+    assert solve._solve_near(column, load, straight.displacement[0]) is None
 
 
 def test_residual_and_volume_ratio_belong_to_the_returned_displacement(scene, jobs):

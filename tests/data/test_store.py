@@ -35,7 +35,7 @@ def solved(monkeypatch):
     """The list of solved loads, extended by each solve."""
     found = []
 
-    def counted(scene, job):
+    def counted(scene, job, guess=None):
         found.append((*job.seed, job.number))
         return solve_load(scene, job)
 
@@ -84,10 +84,7 @@ def test_stored_samples_are_the_loads_of_their_stream_and_meet_the_tolerance(dat
         assert torch.equal(sample.young, drawn.young)
 
 
-def test_the_data_set_carries_modes_fingerprint_seed_and_versions(data, scene):
-    kept = data.store.modes()
-    assert torch.equal(kept["values"], scene.loads.eigenmodes.values)
-    assert torch.equal(kept["vectors"], scene.loads.eigenmodes.vectors)
+def test_the_data_set_carries_fingerprint_seed_and_versions(data, scene):
     card = json.loads((data.store.folder / "scene.json").read_text())
     assert card["fingerprint"] == scene.fingerprint
     assert card["scene"] == json.loads(json.dumps(scene.identity()))
@@ -118,7 +115,7 @@ def test_rejected_loads_are_recorded_with_reason_and_load_factor(hard, tmp_path)
 def test_a_shard_may_hold_rejected_loads_only(scene, fresh, monkeypatch):
     monkeypatch.setattr(
         "dpl.data.solving.worker_pool.solve_load",
-        lambda scene, job: failed_load(scene, job, "never"),
+        lambda scene, job, guess: failed_load(scene, job, "never"),
     )
     fill(fresh, {"train": range(3)})
     assert fresh.missing("train", 4) == [3]
@@ -173,18 +170,6 @@ def test_the_samples_do_not_depend_on_the_size_of_shards(data, fresh, monkeypatc
 # ------------------------------------------------------------------ growing
 
 
-def test_growing_solves_only_the_new_loads_and_gives_the_bytes_of_one_run(data, fresh, solved):
-    fill(fresh, {"train": range(5)})
-    before = fresh.load("train", 5)
-    solved.clear()
-    fill(fresh, {"train": fresh.missing("train", 12)})
-    assert solved == [(0, 0, index) for index in range(5, 12)]
-    assert same([column[:5] for column in fresh.load("train", 12)], before)
-    assert fresh.missing("train", 12) == []
-    fill(fresh)
-    assert content(fresh.folder) == content(data.store.folder)
-
-
 def test_loads_are_samples_before_their_files_are_merged(fresh, monkeypatch):
     monkeypatch.setattr(store_module.Store, "merge", lambda *_: None)
     fill(fresh, {"train": [0, 1, 2, 3, 4, 5, 7]})
@@ -234,7 +219,7 @@ def test_a_second_writer_of_the_whole_or_of_the_same_part_is_refused(fresh):
     running = writer(fresh, 0, 2).solve([("train", range(12))])
     next(running)
     for part in ((), (0, 2), (1, 3)):
-        with pytest.raises(DataSetError, match=f"process {os.getpid()} on "):
+        with pytest.raises(DataSetError, match=f"process {os.getpid()} on {os.uname().nodename}"):
             next(writer(fresh, *part).solve([("train", range(12))]))
     with pytest.raises(DataSetError, match=f"process {os.getpid()} on "):
         repair(fresh)
@@ -376,7 +361,7 @@ def test_an_invalid_line_of_the_journal_is_ignored(copy, line):
 def test_the_summary_states_mean_iterations_and_size(copy):
     (shard,) = copy.shards("train")
     mean = int(shard.columns["iterations"].sum()) / len(shard.tried)
-    assert f"{mean:.1f} Newton iterations" in copy.summary()
+    assert f"{mean:.1f} iterations" in copy.summary()
     with (copy.folder / "large.safetensors").open("wb") as file:
         file.truncate(30_000_000)  # sparse
     assert "sessions, 30 MB" in copy.summary()

@@ -548,7 +548,6 @@ def test_a_mixture_draws_its_families_by_weight_and_names_them(linear):
         family = loads.members[member]
         assert torch.equal(one, family.force_at(point[1 : 1 + family.n_force].numpy()))
     assert loads.n_random == 2 + max(family.n_force for family in loads.members)
-    assert list(loads.arrays()) == ["modal.values", "modal.vectors"]
     twice = fem.MixtureLoads(linear, families, {"modal": 6.0, "point": 2.0, "none": 0.0})
     assert twice.identity() == loads.identity()
 

@@ -1,14 +1,23 @@
 """Drawing and solving a single load."""
 
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from dpl.fem import Load, Status, solve
+from dpl.fem import AndersonSolver, Load, Solution, Status, solve
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
+
+# prediction of the displacement (1, N, D) [-] under a load; None: there is none yet
+Guess = Callable[[Load], Tensor | None]
+# Ritz value of the tangent, relative to K(0) in the rotated frames of the nodes, above which an
+# equilibrium counts as stable without a factorisation [-]. It bounds the eigenvalue from above.
+MIN_RITZ_VALUE = 0.1
 
 
 class LoadKey(NamedTuple):
@@ -35,7 +44,7 @@ class SolvedLoad(NamedTuple):
         residual: ||R_free|| / ||f|| [-].
         volume_ratio: min det F [-].
         load_factor: Fraction of the load for which an equilibrium was found [-].
-        iterations: Number of Newton iterations.
+        iterations: Number of iterations.
         seconds: Wall time of the solve.
         reason: Reason of the rejection; empty if accepted.
     """
@@ -54,12 +63,14 @@ class SolvedLoad(NamedTuple):
     reason: str
 
 
-def solve_load(scene: Scene, job: LoadKey) -> SolvedLoad:
-    """Draw and solve a load."""
+def solve_load(scene: Scene, job: LoadKey, guess: NDArray[np.float64] | None = None) -> SolvedLoad:
+    """Draw and solve a load, if possible from a displacement near its solution, (N, D) [-]."""
     load, point = _draw(scene, job)
     start = time.perf_counter()
     with one_thread():
-        solution = solve(scene.solver, load)
+        solution = None if guess is None else _solve_near(scene, load, torch.from_numpy(guess))
+        if solution is None:
+            solution = solve(scene.solver, load)
     accepted = bool(solution.stable)
     return SolvedLoad(
         job=job,
@@ -75,6 +86,30 @@ def solve_load(scene: Scene, job: LoadKey) -> SolvedLoad:
         seconds=time.perf_counter() - start,
         reason="" if accepted else str(Status(int(solution.status))),
     )
+
+
+def guessed(scene: Scene, job: LoadKey, guess: Guess | None) -> NDArray[np.float64] | None:
+    """Return the prediction for a load, (N, D) [-]; None without one."""
+    if guess is None:
+        return None
+    with torch.no_grad():
+        found = guess(_draw(scene, job)[0])
+    return None if found is None else found[0].numpy()
+
+
+def _solve_near(scene: Scene, load: Load, guess: Tensor) -> Solution | None:
+    """Return the stable equilibrium near a guess (N, D), found without a factorisation, or None.
+
+    The solver of the scene decides on a load whose iteration does not converge and on one whose
+    equilibrium is unstable or nearly so. Data sets therefore hold the loads that it accepts.
+    """
+    newton = scene.newton
+    *_, solution = AndersonSolver(newton).iterate(load, guess=guess[None])
+    if not solution.converged:
+        return None
+    linear = newton.linear_solver.with_parameters(load.parameters)
+    value = linear.corotational.smallest_ritz_value(solution.displacement)
+    return solution if value > MIN_RITZ_VALUE else None
 
 
 def failed_load(scene: Scene, job: LoadKey, reason: str, seconds: float = 0.0) -> SolvedLoad:

@@ -22,7 +22,17 @@ from multiprocessing.connection import Connection
 from types import FrameType
 from typing import Any
 
-from dpl.data.solving.solve import LoadKey, SolvedLoad, failed_load, solve_load
+import numpy as np
+from numpy.typing import NDArray
+
+from dpl.data.solving.solve import (
+    Guess,
+    LoadKey,
+    SolvedLoad,
+    failed_load,
+    guessed,
+    solve_load,
+)
 from dpl.scene import Scene
 from dpl.system.processes import block_signals, spawn_context
 
@@ -83,6 +93,7 @@ def solve_loads(
     workers: int,
     timeout: float | None = None,
     stop: object = None,
+    guess: Guess | None = None,
 ) -> Generator[SolvedLoad, None, None]:
     """Yield solved loads in the order in which they are finished.
 
@@ -92,6 +103,8 @@ def solve_loads(
         workers: Number of processes, one core each; 0: solve in this process, without time limit.
         timeout: Time limit for a load [s]; the first load of a worker has more. None: no limit.
         stop: Once its truth value is True, no further load is started.
+        guess: Function of a load that returns a displacement near its solution; called in this
+            process when the solve starts. Only for a scene that is solved by Newton's method.
 
     Raises:
         RuntimeError: Workers die repeatedly.
@@ -99,7 +112,7 @@ def solve_loads(
     jobs = iter(jobs)
     if workers == 0:
         while not stop and (job := next(jobs, None)):
-            yield solve_load(scene, job)
+            yield solve_load(scene, job, guessed(scene, job, guess))
         return
     limit = math.inf if timeout is None else timeout
     todo = deque(islice(jobs, max(workers, RETRY_DELAY)))
@@ -109,7 +122,8 @@ def solve_loads(
         while True:
             for worker in pool:
                 if worker.job is None and todo and not stop:
-                    worker.submit(todo.popleft(), limit)
+                    job = todo.popleft()
+                    worker.submit(job, guessed(scene, job, guess), limit)
                     todo.extend(islice(jobs, 1))
             if not any(worker.job for worker in pool):
                 break
@@ -152,12 +166,12 @@ class _Worker:
         self.deadline = math.inf
         self._grace = STARTUP_GRACE
 
-    def submit(self, job: LoadKey, limit: float) -> None:
-        """Start to solve a load."""
+    def submit(self, job: LoadKey, guess: NDArray[np.float64] | None, limit: float) -> None:
+        """Start to solve a load, perhaps from a guess."""
         self.job, self.deadline = job, time.monotonic() + limit + self._grace
         self._grace = 0.0
         with contextlib.suppress(BrokenPipeError):  # `_wait` detects that it died while idle
-            self.pipe.send(job)
+            self.pipe.send((job, guess))
 
     def kill(self) -> None:
         self.process.kill()
@@ -217,4 +231,4 @@ def _work(pipe: Connection, scene: Scene) -> None:
         signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
-            pipe.send(solve_load(scene, pipe.recv()))
+            pipe.send(solve_load(scene, *pipe.recv()))

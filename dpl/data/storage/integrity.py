@@ -1,17 +1,15 @@
 """Verification and repair of data sets."""
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from safetensors.torch import save
-from torch import Tensor
 
 from dpl.data.storage.shard import Columns, reasons, to_dense
-from dpl.data.storage.store import MODES, Store
+from dpl.data.storage.store import Store
 from dpl.scene import Scene
-from dpl.system.files import DataSetError, exclusive_lock, sync_folder, write_file
+from dpl.system.files import DataSetError, exclusive_lock, sync_folder
 
 # first words of the reasons of loads that failed because of the machine; `repair` retries these
 MACHINE_FAILURES = ("timed out", "its worker died")
@@ -28,11 +26,6 @@ def verify(store: Store) -> Iterator[tuple[Path, str]]:
     """
     if not store.exists():
         raise DataSetError(f"{store.folder} holds no data set yet; generate it first")
-    try:
-        flaw = check_modes(store.scene, store.modes())
-    except DataSetError as error:
-        flaw = f"is damaged: {error}"
-    yield store.folder / MODES, flaw
     for path in store.files():
         try:
             stream = store.stream(store.describe(path).split)
@@ -54,33 +47,19 @@ def repair(store: Store) -> list[tuple[Path, str]]:
     """
     if not store.exists():
         return []
-    modes = store.folder / MODES
     with exclusive_lock(store.folder):
         flaws = {path: flaw for path, flaw in verify(store) if flaw}
         for shard in store.shards():
             if any(reason.startswith(MACHINE_FAILURES) for reason in reasons(shard.columns)):
                 flaws.setdefault(shard.path, "holds loads that failed because of the machine")
         for path in [*flaws, *store.folder.rglob(".*.part")]:
-            if path == modes:
-                write_file(modes, save(dict(store.scene.loads.arrays())))
-            elif path.is_symlink() or not path.is_dir():
+            if path.is_symlink() or not path.is_dir():
                 path.unlink()
             else:
                 with contextlib.suppress(OSError):  # a folder of the user that is not empty
                     path.rmdir()
         sync_folder(store.folder)
-    done = {path: "written again" if path == modes else "removed" for path in flaws}
-    return [(path, f"{flaw}; it is {done[path]}") for path, flaw in flaws.items()]
-
-
-def check_modes(scene: Scene, stored: Mapping[str, Tensor]) -> str:
-    """Return the flaw of stored modes, whose signs and bases count; empty if there is none."""
-    equal = [
-        (stored[name].shape, stored[name].dtype) == (array.shape, array.dtype)
-        and torch.allclose(stored[name], array, rtol=0, atol=1e-6 * float(array.abs().max()))
-        for name, array in scene.loads.arrays().items()
-    ]
-    return "" if all(equal) else "holds other modes than this scene has"
+    return [(path, f"{flaw}; it is removed") for path, flaw in flaws.items()]
 
 
 def check_shard(scene: Scene, stream: tuple[int, int], shard: Columns) -> str:

@@ -1,7 +1,6 @@
 """Data set on disk: safetensors shards of solved loads.
 
     FOLDER/scene.json            fingerprint of the scene with its fields, seed, versions
-    FOLDER/modes.safetensors     eigenvalues and eigenvectors that the loads are made of
     FOLDER/train-000000.safetensors, ...  solved loads, named by the first one
     FOLDER/journal.jsonl         one line per session: date, machine, duration
 
@@ -24,8 +23,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load
 from torch import Tensor
 
 from dpl.data.solving.solve import SolvedLoad
@@ -47,7 +44,6 @@ from dpl.system.files import DataSetError, read_regular_file, write_file
 
 FORMAT = 5
 STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
-MODES = "modes.safetensors"
 SHARD_NAME = re.compile(rf"({'|'.join(STREAMS)})-(\d{{6,16}})\.safetensors")
 HEADER = 100_000  # largest size of a shard without its numbers [bytes]
 SHARD_SIZE = 64  # loads in one block, and at most in one file
@@ -100,7 +96,7 @@ class Store:
             raise DataSetError(f"data.folder = {self.folder} must be a folder; choose another")
         names = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
         if card.name not in names:
-            if {name for name in names if name[0] != "."} <= {MODES}:
+            if all(name[0] == "." for name in names):
                 return False
             raise DataSetError(
                 f"{self.folder} is not empty and no data set; choose another data.folder"
@@ -117,7 +113,9 @@ class Store:
 
     def files(self) -> list[Path]:
         """Return the files that are or could be shards."""
-        return [p for p in sorted(self.folder.glob("*.safetensors")) if p.name != MODES]
+        return sorted(
+            path for split in STREAMS for path in self.folder.glob(f"{split}-*.safetensors")
+        )
 
     def shards(self, split: str | None = None, block: int | None = None) -> list[Shard]:
         """Return the shards, of one split or of one block; files that are none are left out.
@@ -277,19 +275,6 @@ class Store:
         numbers = 3 * math.prod(self.scene.problem.shape) + 2 * self.scene.loads.n_random + 16
         return HEADER + (8 * numbers + REASON) * loads
 
-    def modes(self) -> dict[str, Tensor]:
-        """Return the stored `LoadFamily.arrays`; raise DataSetError if their file is damaged."""
-        path = self.folder / MODES
-        expected = self.scene.loads.arrays()
-        most = HEADER + 16 * sum(array.numel() for array in expected.values())
-        try:
-            found = load(read_regular_file(path, most))
-            return {name: found[name] for name in expected}
-        except (FileNotFoundError, KeyError, SafetensorError, ValueError) as error:
-            raise DataSetError(
-                f"{path} is damaged: {error}; scripts/generate.py action=repair makes it again"
-            ) from None
-
     def acceptance(self) -> list[AmplitudeBin]:
         """Return the numbers of tried and accepted loads by amplitude, over all splits."""
         shards = self.shards()
@@ -306,7 +291,7 @@ class Store:
                 iterations = sum(int(shard.columns["iterations"].sum()) for shard in shards)
                 lines.append(
                     f"  {split}: {accepted} of {tried} loads accepted, "
-                    f"{iterations / tried:.1f} Newton iterations"
+                    f"{iterations / tried:.1f} iterations"
                 )
         rejected = Counter(one for shard in self.shards() for one in reasons(shard.columns))
         lines += [f"  {count} rejected: {reason}" for reason, count in sorted(rejected.items())]

@@ -101,10 +101,6 @@ class LoadFamily(Protocol):
         """
         ...
 
-    def arrays(self) -> Mapping[str, Tensor]:
-        """Return the arrays from which forces are computed; data sets store and compare them."""
-        ...
-
     def identity(self) -> dict[str, Any]:
         """Return the options that determine the loads, as plain data, without Young's moduli.
 
@@ -242,9 +238,6 @@ class RandomLoads(LoadFamily):
         foreign = torch.where(self.loadable_dofs, 0.0, own).flatten(1).norm(dim=1) / size
         distance = torch.where(foreign > MAX_DISTANCE, foreign, math.nan)
         return size / self.largest_force, distance
-
-    def arrays(self) -> Mapping[str, Tensor]:
-        return {}
 
     def identity(self) -> dict[str, Any]:
         return identity_of(self, exclude=("linear", "young"))

@@ -119,11 +119,6 @@ class MixtureLoads(RandomLoads):
         best, columns = best_fit(amplitude.numpy(), distance.numpy()), range(len(own))
         return amplitude[best, columns], distance[best, columns]
 
-    def arrays(self) -> Mapping[str, Tensor]:
-        """Return the arrays of all families; their names begin with that of the family."""
-        members = zip(self.names, self.members, strict=True)
-        return {f"{name}.{key}": a for name, one in members for key, a in one.arrays().items()}
-
     def identity(self) -> dict[str, Any]:
         """Return the options with the identities of the families."""
         members = zip(self.names, self.members, strict=True)

@@ -4,7 +4,7 @@ Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.2.2: f = Phi q wit
 eigenmodes of K(0), restricted to random areas of the boundary.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -145,10 +145,6 @@ class ModalLoads(SurfaceLoads):
         q, factor = self.distribution(TESTED), self.amplitude(TESTED)
         ends = [float(a * b) for a in (q.min(), q.max()) for b in (factor.min(), factor.max())]
         return min(ends), max(ends)
-
-    def arrays(self) -> Mapping[str, Tensor]:
-        """Return eigenvalues and eigenvectors, see `Modes`."""
-        return self.eigenmodes._asdict()
 
     def identity(self) -> dict[str, Any]:
         """Return the options that decide the loads: `modes` if they are given, else `n_modes`."""

@@ -18,7 +18,7 @@ from dpl.system.files import append_jsonl
 class ThroughputMonitor(L.Callback):
     """Logs throughput and memory [GB] once per epoch; the time of validation does not count.
 
-    docs/monitoring.md describes each tag. The rates of a stream are those of `StreamRates`.
+    docs/monitoring.md describes each tag.
     """
 
     def __init__(self) -> None:
@@ -55,8 +55,8 @@ class ThroughputMonitor(L.Callback):
         means = {"rate/steps": (trainer.global_step - self._steps) / seconds}
         data = getattr(trainer, "datamodule", None)
         if isinstance(data, DataModule) and (rates := data.source.rates) is not None:
-            sums |= {"rate/produced": rates.produced, "online/buffer": float(rates.buffer)}
-            means |= {"online/waiting": rates.waiting, "online/uses": rates.uses}
+            sums |= {"rate/produced": rates["produced"], "online/buffer": rates["buffer"]}
+            means |= {f"online/{name}": rates[name] for name in ("waiting", "uses")}
         if pl_module.device.type == "cuda":
             sums["memory/gpu"] = torch.cuda.max_memory_allocated(pl_module.device) / 1e9
         pl_module.log_dict(sums, sync_dist=True, reduce_fx="sum")

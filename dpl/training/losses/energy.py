@@ -6,7 +6,7 @@ from torch import Tensor
 from dpl.fem.postprocess import RestStiffness, potential_energy
 from dpl.scene import Sample
 from dpl.system.checks import check_range
-from dpl.training.losses.loss import Loss, LossContext, PrescribedGradient, clamp_scale
+from dpl.training.losses.loss import Loss, LossContext, clamp_scale, with_gradient
 
 
 class EnergyNormLoss(Loss):
@@ -40,7 +40,7 @@ class EnergyNormLoss(Loss):
             error, size = (fields * images).sum(dim=(1, 2)).chunk(2)
             size = clamp_scale(size, self.floor if self.relative else torch.inf)
             slope = 2 * images[: len(prediction)] / size[:, None, None]
-        return PrescribedGradient.apply(prediction, error / size, slope).mean()
+        return with_gradient(prediction, error / size, slope).mean()
 
 
 class PotentialEnergyLoss(Loss):
@@ -87,4 +87,4 @@ class PotentialEnergyLoss(Loss):
                 slope = torch.where(sound[:, None, None], slope, image)
             slope = slope / scale[:, None, None]
             self.terms = {"inverted": 1 - sound.double().mean()}
-        return PrescribedGradient.apply(prediction, energy / scale, slope).mean()
+        return with_gradient(prediction, energy / scale, slope).mean()

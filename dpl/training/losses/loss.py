@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import lightning as L
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from dpl.fem import Problem
 from dpl.scene import Sample
@@ -129,18 +128,13 @@ def clamp_scale(sizes: Tensor, floor: float) -> Tensor:
     return torch.where(sizes > 0, sizes, 1.0)
 
 
-class PrescribedGradient(torch.autograd.Function):
-    """Values (B,) of displacements (B, N, D) with gradients (B, N, D) that the caller computes."""
+def with_gradient(displacement: Tensor, value: Tensor, gradient: Tensor) -> Tensor:
+    """Return values (B,) whose gradient with respect to displacements (B, N, D) is prescribed.
 
-    @staticmethod
-    def forward(ctx: Any, displacement: Tensor, value: Tensor, gradient: Tensor) -> Tensor:
-        """Return `value`, (B,)."""
-        ctx.save_for_backward(gradient)
-        return value.clone()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        """Return the gradient with respect to the displacement, (B, N, D)."""
-        (gradient,) = ctx.saved_tensors
-        return upstream[:, None, None] * gradient, None, None
+    Args:
+        displacement: The displacements.
+        value: The values, without a gradient.
+        gradient: The gradient, (B, N, D).
+    """
+    zero = displacement - displacement.detach()
+    return value + (gradient * zero).sum(dim=(1, 2))

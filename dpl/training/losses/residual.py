@@ -10,7 +10,7 @@ from torch import Tensor
 from dpl.fem.postprocess import tangent_product
 from dpl.scene import Sample
 from dpl.system.checks import check_range
-from dpl.training.losses.loss import Loss, LossContext, PrescribedGradient, squared_error
+from dpl.training.losses.loss import Loss, LossContext, squared_error, with_gradient
 from dpl.training.losses.supervised import MSE
 
 MAX_RESIDUALS = 64  # samples whose residual norms are averaged
@@ -106,4 +106,4 @@ def residual_norm(prediction: Tensor, batch: Sample, physics: LossContext) -> Te
     unit = residual / length.clamp(min=torch.finfo(length.dtype).tiny)[:, None, None]
     slope = tangent_product(problem, prediction.detach(), unit) / physics.largest_force
     slope = torch.where(slope.isfinite() & sound[:, None, None], slope, 0.0)
-    return PrescribedGradient.apply(prediction, norm, slope)
+    return with_gradient(prediction, norm, slope)
