@@ -106,7 +106,8 @@ def _panels(net: Unrolled, test: Sample) -> list[_Panel]:
         solver = net.correction()
         last = predicted[0]
         if solver is not None:
-            last = solver.correct(load.force[0], last, parameters=load.parameters[0], steps=1)
+            *_, state = solver.states(load, guess=predicted[:1], max_iter=1)
+            last = state.displacement[0]
     sampled = f"strain or stress $\\varphi(G c)$\nat {len(net.cells)} cells"
     centres = (problem.points + linear)[problem.cells[net.cells]].mean(dim=1)
     return [

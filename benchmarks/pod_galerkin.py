@@ -10,7 +10,7 @@ from dpl.fem import LinearSolver, Problem
 from dpl.fem.rom import Cubature, cubature
 from dpl.fem.rom.ecsw import ReducedMesh, refuse_follower_loads, whitening
 from dpl.fem.rom.pod import pod
-from dpl.fem.solvers.load_stepping import LoadStepping, longest_valid_step
+from dpl.fem.solvers.newton import LoadStepping
 
 TOL = 1e-5  # reduced relative residual at which the iterations stop [-]
 MAX_ITER = 30  # for one part of a load
@@ -83,7 +83,8 @@ class PODGalerkin:
         self.problem, self.lift, self.chosen = problem, lift, chosen
         white = vectors @ whitening(problem, vectors)
         self.cells = ReducedMesh(problem, white, chosen.cells, chosen.weights.double())
-        self._stiffness = self.cells.product(self.cells.at_rest(), self.cells.basis)
+        at_rest = self._cell_tangents(self.cells.problem.stiffness_at_rest())
+        self._stiffness = _product(at_rest, self.cells.basis)
         self._identity = torch.eye(vectors.shape[2], dtype=torch.float64)
         self._stiffness_error = self._identity - self.cells.basis.T @ self._stiffness
         self._rows = white.flatten(0, 1)
@@ -176,13 +177,13 @@ class PODGalerkin:
         self, load: _Load, state: _State, step: Tensor, jump: float, target: float
     ) -> _State | None:
         """Return the state after the longest of the steps 1, 1/2, ... that inverts no cell."""
-
-        def state_after(length: float) -> _State:
+        bound = MIN_DETF_RATIO * min(state.volume_ratio, 1.0)
+        for length in (0.5**k for k in range(10)):
             factor = target if length == 1 else state.factor + length * jump
             after = self._state(load, state.y + length * step, factor)
-            return after._replace(length=length)
-
-        return longest_valid_step(state_after, MIN_DETF_RATIO * min(state.volume_ratio, 1.0))
+            if after.volume_ratio > bound:
+                return after._replace(length=length)
+        return None
 
     def _reduce(self, force: Tensor) -> _Load:
         """Return a load (N, D) in reduced coordinates."""
@@ -197,7 +198,8 @@ class PODGalerkin:
     def _state(self, load: _Load, y: Tensor, factor: float) -> _State:
         """Return the evaluated state at coordinates y (R,) with a part of the offset."""
         cells = self.cells
-        field = cells.field(cells.basis @ y + factor * load.cell_offset)
+        values = cells.basis @ y + factor * load.cell_offset
+        field = values.view(1, *cells.problem.shape)
         force, volume = cells.problem.evaluate(field)
         internal = self._internal(load, force, y, factor)
         return _State(y, factor, field, internal, float(volume))
@@ -210,6 +212,14 @@ class PODGalerkin:
         """Return W^T f, (R,), of forces on the cells' nodes."""
         return force.flatten() @ self.cells.basis
 
+    def _cell_tangents(self, entries: Tensor) -> Tensor:
+        """Return U, (C, A D, A D), with U + U^T the cells' matrices, of their entries (nnz,)."""
+        size = self.cells.basis.shape[0] // len(self.chosen.cells)
+        row, column = torch.triu_indices(size, size)
+        upper = entries.new_zeros(len(self.chosen.cells), size, size)
+        upper[:, row, column] = entries.view(-1, len(row)) * torch.where(row == column, 0.5, 1.0)
+        return upper
+
     def _tangent(
         self, load: _Load, state: _State, target: float, jump: float
     ) -> tuple[Tensor | None, Tensor]:
@@ -220,9 +230,9 @@ class PODGalerkin:
         system = cells.problem.linearise(state.cell_displacement, state.gap)
         if not system.valid:
             system = cells.problem.linearise(state.cell_displacement)
-        upper = cells.tangents(system.tangent[0])
+        upper = self._cell_tangents(system.tangent[0])
         right = target * load.force - self._internal(load, system.force, state.y, state.factor)
-        pull = self._project(cells.product(upper, load.cell_offset))
+        pull = self._project(_product(upper, load.cell_offset))
         right -= jump * (pull + load.offset_error)
         rows = self._single.view(*upper.shape[:2], -1)  # float32 in half the time of float64
         product = self._single.T @ (upper.float() @ rows).flatten(0, 1)
@@ -243,6 +253,12 @@ class PODGalerkin:
 def _residual(load: _Load, state: _State, target: float) -> float:
     """Return the reduced relative residual under `target` times a load."""
     return _norm(target * load.force - state.internal) / (target * load.scale)
+
+
+def _product(upper: Tensor, values: Tensor) -> Tensor:
+    """Return (U + U^T) v of cells, (C A D, k) or (C A D,), of U (C, A D, A D)."""
+    v = values.view(*upper.shape[:2], -1)
+    return (upper @ v + upper.mT @ v).view_as(values)
 
 
 def _broyden(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:

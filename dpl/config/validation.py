@@ -70,7 +70,7 @@ EXPECTED_TYPES = {  # base classes of the object that the call under a key retur
         "dpl.fem.assembly.follower_pressure.FollowerPressure",
         "dpl.fem.assembly.active_stress.ActiveStress",
     },
-    "solver": {"dpl.fem.solvers.reference.ReferenceSolver"},
+    "solver": {"dpl.fem.solvers.linear.ReferenceSolver"},
     "loads": {"dpl.fem.loads.family.LoadFamily"},
     "data": {"dpl.data.dataset.DataSet", "dpl.data.datamodule.DataModule"},
     "model": {"torch.nn.modules.module.Module"},

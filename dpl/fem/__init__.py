@@ -60,9 +60,8 @@ if TYPE_CHECKING:
     from dpl.fem.solvers.bifurcation import post_buckling_branches
     from dpl.fem.solvers.differentiable import DifferentiableSolve
     from dpl.fem.solvers.error_estimate import ErrorEstimate, estimate_error
-    from dpl.fem.solvers.linear import LinearSolver
+    from dpl.fem.solvers.linear import LinearSolver, ReferenceSolver
     from dpl.fem.solvers.newton import Newton
-    from dpl.fem.solvers.reference import ReferenceSolver
     from dpl.fem.solvers.rigid_patch import RigidPatch
     from dpl.fem.solvers.solution import Load, Solution, Solver, Status, evaluate_solution, solve
     from dpl.fem.symmetry import symmetries

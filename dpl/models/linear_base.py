@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from dpl.fem import Load
-from dpl.fem.rom.stiffness_iteration import StiffnessIteration
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.models.linear_response import LinearResponse
 from dpl.scene import Scene
@@ -25,10 +24,10 @@ class LinearBase:
         """Take the scene.
 
         Raises:
-            ValueError: K(0) changes too much with the parameters, see `StiffnessIteration`.
+            ValueError: K(0) changes too much with the parameters, see `StiffnessTerms`.
         """
         self._scene, self._problem = scene, scene.problem
-        StiffnessIteration.of_terms(StiffnessTerms.of(scene.problem))  # may raise
+        StiffnessTerms.of(scene.problem).require_few_steps()
 
     @cached_property
     def _response(self) -> LinearResponse:

@@ -14,13 +14,17 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.nn.functional import pad
 
-from dpl.fem.linear.condensation import Condensed, condense, condensed_solves
-from dpl.fem.linear.krylov import conjugate_gradients
+from dpl.fem.linear.condensation import (
+    Condensed,
+    Layer,
+    condense,
+    condensed_layers,
+    condensed_solves,
+    solve_layers,
+)
+from dpl.fem.linear.krylov import conjugate_gradients, conjugate_gradients_of_tensors
 from dpl.fem.materials.material import Material
-from dpl.fem.rom import stiffness_iteration
-from dpl.fem.rom.stiffness_iteration import StiffnessIteration, TermMatrices, node_body
-from dpl.fem.solvers.condensed_layers import CondensedLayers
-from dpl.fem.solvers.parity_factor import OrbitForm
+from dpl.fem.solvers.parity_factor import OrbitForm, TermMatrices
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import SymmetryGroup
 from dpl.models.precision import full_precision
@@ -88,7 +92,7 @@ class LinearResponse:
     reflections of the body (`dpl.fem.linear.condensation`). A solution is a sequence of products
     with them, the same for every load: there is no basis that a load on a small area could miss.
     If K(0) depends on parameters of the law, the blocks of one parameter are the preconditioner of
-    conjugate gradients (`StiffnessIteration`).
+    conjugate gradients (`StiffnessTerms`).
 
     Compiled loops solve few loads on the CPU, and all that need steps, one after the other. Larger
     batches, other devices and traced graphs are solved by tensor operations.
@@ -100,10 +104,10 @@ class LinearResponse:
         """Take the scene and the symmetries of the body.
 
         Raises:
-            ValueError: K(0) changes too much with the parameters, see `StiffnessIteration`.
+            ValueError: K(0) changes too much with the parameters, see `StiffnessTerms`.
         """
         self._scene, self._group = scene, group
-        self.iteration = StiffnessIteration.of_terms(self.terms)
+        self.terms.require_few_steps()
         self._orbits_on: dict[torch.device, _Orbits] = {}
         self._blocks_on: dict[torch.device, _Blocks] = {}
 
@@ -126,14 +130,14 @@ class LinearResponse:
 
         They are float64 if the solutions of random forces lose more than `MAX_ROUNDING`.
         """
-        matrices = self.form.matrices(node_body(self.terms, self.iteration))
+        matrices = self.form.matrices(self.terms.node_body)
         exact = condense(matrices, self.form.points)
         rounded = exact._replace(values=exact.values.astype(np.float32))
         return rounded if _difference(rounded, exact) < MAX_ROUNDING else exact
 
     @cached_property
     def _matrices(self) -> TermMatrices:
-        return TermMatrices.of(self.terms, self.form, self.iteration)
+        return TermMatrices.of(self.terms, self.form)
 
     @cached_property
     def _supports(self) -> Tensor:
@@ -181,9 +185,9 @@ class LinearResponse:
             condensed_solves(table, unknowns, values, parts.copy(), found)
             return found
 
-        if not self.iteration.varies:
+        if not self.terms.varies:
             return of_node
-        matrix, ends = self._matrices.at(factors), (self.iteration.rtol, self.iteration.max_steps)
+        matrix, ends = self._matrices.at(factors), (self.terms.rtol, self.terms.max_steps)
 
         def precondition(residual: Array) -> Array:
             found = of_node(residual.reshape(shape).astype(values.dtype))
@@ -226,7 +230,7 @@ class LinearResponse:
             right: Forces by parity, (B, M m), float64.
             factors: Factors of the terms, and 1, (B, T + 1), float64.
         """
-        many = right.shape[0] > FEW and not self.iteration.varies  # which need no steps
+        many = right.shape[0] > FEW and not self.terms.varies  # which need no steps
         if right.device.type != "cpu" or many:
             return self.by_tensors(right, factors)
         size, shape = _largest(right), self.orbits.dofs.shape
@@ -246,13 +250,13 @@ class LinearResponse:
 
     def _batch_by_tensors(self, right: Tensor, factors: Tensor) -> Tensor:
         own = self._tensors(right.device)
-        count, dtype = len(self.blocks.values), own.layers.layers[0].inverse.dtype
+        count, dtype = len(self.blocks.values), own.layers[0].inverse.dtype
 
         def of_node(f: Tensor) -> Tensor:
             forces = f.unflatten(1, (count, -1)).transpose(0, 1).to(dtype)
-            return own.layers.solve(forces).transpose(0, 1).flatten(1).double()
+            return solve_layers(own.layers, forces).transpose(0, 1).flatten(1).double()
 
-        if not self.iteration.varies:
+        if not self.terms.varies:
             size = _largest(right)
             return of_node(right / size) * size
         matrix = torch.einsum("bk,knw->bnw", factors, own.entries)
@@ -260,8 +264,8 @@ class LinearResponse:
         def product(x: Tensor) -> Tensor:
             return (matrix * x[:, own.columns]).sum(dim=-1)
 
-        ends = self.iteration.rtol, self.iteration.max_steps
-        return stiffness_iteration.conjugate_gradients(product, of_node, right, *ends)
+        ends = self.terms.rtol, self.terms.max_steps
+        return conjugate_gradients_of_tensors(product, of_node, right, *ends)
 
     def products(self, x: Tensor) -> Tensor:
         """Return the product of each term with x (B, M m), (B, T + 1, M m)."""
@@ -284,9 +288,9 @@ class LinearResponse:
     def _tensors(self, device: torch.device) -> "_Blocks":
         if device not in self._blocks_on:
             columns, entries = torch.zeros(0, dtype=torch.int64), torch.zeros(0)
-            if self.iteration.varies:
+            if self.terms.varies:
                 columns, entries = self._matrices.padded()
-            layers = CondensedLayers.of(self.blocks, device)
+            layers = condensed_layers(self.blocks, device)
             made = _Blocks(layers, columns.to(device), entries.to(device))
             if torch.compiler.is_compiling():  # tensors of a traced graph have no values
                 return made
@@ -311,7 +315,7 @@ class _Orbits(NamedTuple):
 class _Blocks(NamedTuple):
     """Blocks of the node and terms of K(0) on one device, see `TermMatrices.padded`."""
 
-    layers: CondensedLayers
+    layers: list[Layer]
     columns: Tensor
     entries: Tensor
 
@@ -331,7 +335,7 @@ class _Solve(Function):
         x, factors = ctx.saved_tensors
         right: Tensor = _Solve.apply(gradients[0], factors, ctx.response)
         of_factors = None
-        if ctx.needs_input_grad[1] and ctx.response.iteration.varies:
+        if ctx.needs_input_grad[1] and ctx.response.terms.varies:
             of_factors = -torch.einsum("bn,bkn->bk", right, ctx.response.products(x))
         return right, of_factors, None
 

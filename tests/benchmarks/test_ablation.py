@@ -44,12 +44,12 @@ def test_errors_are_those_of_the_predictions_and_of_a_newton_step(build, sets, m
     row, net = fitted(ablation.Variant("", {"rank": 40, "stages": 0}), build, sets)
     test = sets[1]
     predicted, solver = net(test.force), net.correction()
-    pairs = zip(test.force, predicted, strict=True)
-    corrected = torch.stack([solver.correct(f, u, steps=1) for f, u in pairs])
-    for load, guess in zip(test.load.unbatch(), predicted, strict=True):
-        after = solver.correct(load.force[0], guess, steps=4)  # the first may go too far
-        left = solver.correction(load, after[None])[1]
-        assert left < 0.2 * solver.correction(load, guess[None])[1]
+    pairs = list(zip(test.load.unbatch(), predicted.split(1), strict=True))
+    ends = [list(solver.states(load, guess=u, max_iter=1))[-1] for load, u in pairs]
+    corrected = torch.cat([end.displacement for end in ends])
+    for load, u in pairs:
+        first, *_, last = solver.states(load, guess=u, max_iter=4)  # the first may go too far
+        assert last.error < 0.2 * first.error
     for field, e_mean, worst in (
         (predicted, row.e_mean, row.rel_L2_worst),
         (corrected, row.e_mean_corrected, row.rel_L2_worst_corrected),

@@ -7,15 +7,12 @@ from scipy.linalg import norm
 from scipy.sparse import block_diag, csr_array, diags_array, eye_array, kron
 
 from dpl.fem.linear.condensation import (
-    Condensed,
     condense,
-    condensed_block_solve,
+    condensed_layers,
     condensed_solves,
-    front_blocks,
+    solve_layers,
 )
-from dpl.fem.linear.dissection import LEAF, nested_dissection
 from dpl.fem.linear.interface import SingularMatrix
-from dpl.fem.solvers.condensed_layers import CondensedLayers
 
 
 def laplacian(shape):
@@ -65,26 +62,6 @@ def graph(request):
     return GRAPHS[request.param]
 
 
-def test_each_unknown_is_a_pivot_once_and_boundaries_are_eliminated_later(graph):
-    matrix, points = graph
-    fronts = nested_dissection(abs(matrix), points)
-    pivots = np.concatenate([front.pivots for front in fronts])
-    assert sorted(pivots) == list(range(matrix.shape[0]))
-    number = np.empty(len(pivots), int)
-    for k, front in enumerate(fronts):
-        number[front.pivots] = k
-    for k, front in enumerate(fronts):
-        assert (number[front.boundary] > k).all()
-        for child in front.children:
-            allowed = np.concatenate([front.pivots, front.boundary])
-            assert np.isin(fronts[child].boundary, allowed).all()
-
-
-def test_a_solid_is_divided_into_small_parts():
-    fronts = nested_dissection(abs(GRAPHS["solid"][0]), GRAPHS["solid"][1])
-    assert max(len(front.pivots) for front in fronts if not front.children) <= LEAF
-
-
 def test_all_solutions_equal_those_of_a_dense_factorisation(graph):
     matrix, points = graph
     size = matrix.shape[0]
@@ -92,9 +69,9 @@ def test_all_solutions_equal_those_of_a_dense_factorisation(graph):
     random = np.random.default_rng(1).standard_normal((size, 3))
     random[:, 2] = np.arange(size) == size // 2  # one entry: fronts without forces are left out
     exact = np.linalg.solve(matrix.toarray(), random)
-    many = random.copy()
-    condensed_block_solve(blocks.fronts, blocks.values[0], many)
-    assert norm(many - exact) < 1e-11 * norm(exact)
+    right = torch.from_numpy(random.T.copy()).expand(2, -1, -1)
+    for k, many in enumerate(solve_layers(condensed_layers(blocks, "cpu"), right).numpy()):
+        assert norm((1 + k) * many.T - exact) < 1e-11 * norm(exact)
     table, unknowns, _ = blocks.fronts
     for dtype, most in ((np.float64, 1e-11), (np.float32, 1e-5)):
         values = blocks.values.astype(dtype)
@@ -105,25 +82,12 @@ def test_all_solutions_equal_those_of_a_dense_factorisation(graph):
                 assert norm((1 + k) * solution - expected) <= most * norm(expected)
 
 
-def test_the_tensor_operations_equal_the_loops(graph):
-    matrix, points = graph
-    blocks = condense([matrix, 3 * matrix], points)
-    layers = CondensedLayers.of(blocks, torch.device("cpu"))
-    right = np.random.default_rng(2).standard_normal((2, 4, matrix.shape[0]))
-    found = layers.solve(torch.from_numpy(right)).numpy()
-    for k, values in enumerate(blocks.values):
-        expected = right[k].T.copy()
-        condensed_block_solve(blocks.fronts, values, expected)
-        assert norm(found[k].T - expected) < 1e-11 * norm(expected)
-
-
 def test_the_blocks_of_a_solid_are_smaller_than_its_inverse():
     matrix, points = GRAPHS["solid"]
     blocks = condense([matrix], points)
     assert blocks.values.size < 0.5 * matrix.shape[0] ** 2
-    parts = front_blocks(*Condensed(blocks.fronts, blocks.values[0]))
-    assert sum(one.inverse.size + one.coupling.size for one in parts) == blocks.values.size
-    assert all((one.inverse == one.inverse.T).all() for one in parts)
+    for layer in condensed_layers(blocks, "cpu"):
+        assert torch.equal(layer.inverse, layer.inverse.mT)
 
 
 def test_an_indefinite_matrix_is_refused():

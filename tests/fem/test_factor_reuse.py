@@ -12,7 +12,7 @@ from torch import Tensor
 
 from benchmarks.stress.fixtures import column, cube
 from dpl import fem
-from dpl.fem.linear import BandedCholesky, Pardiso, SuperLU, multigrid_installed
+from dpl.fem.linear import Pardiso, SuperLU, multigrid_installed
 from dpl.fem.linear.superlu import SuperLUFactor
 from dpl.fem.solvers import factor_reuse as reuse_module
 
@@ -156,17 +156,6 @@ def test_factorisations_are_counted(beam, pull, counted, q):
     assert answer.factorisations.item() < answer.iterations.item() - 1
 
 
-def test_without_reuse_every_tangent_is_factorised(beam, pull, monkeypatch):
-    """No factor is used as a preconditioner."""
-    problem = beam(NH)
-    monkeypatch.setattr(SuperLUFactor, "apply", None)
-    answer = fem.solve(
-        fem.Newton(problem, linear="superlu", factor_reuse_tol=0.0), load_of(pull(problem, 40.0))
-    )
-    assert answer.converged.all()
-    assert answer.factorisations.item() == answer.iterations.item() - 1
-
-
 @pytest.mark.parametrize("reuse", [0.01, 0.1, 0.5])
 def test_factors_are_reused_only_below_factor_reuse_tol(beam, pull, reuse):
     problem = beam(NH)
@@ -204,32 +193,6 @@ def test_poor_preconditioner_is_replaced_after_the_largest_number_of_steps(
     assert torch.equal(answer.displacement, every.displacement)
 
 
-def test_factor_that_cannot_be_applied_is_replaced(beam, pull, monkeypatch):
-    problem = beam(NH)
-    load = load_of(pull(problem, 40.0))
-    every, _ = pair(problem, load)
-
-    def fail(self, right):
-        raise fem.SingularMatrix("gone")
-
-    monkeypatch.setattr(SuperLUFactor, "apply", fail)
-    answer = fem.solve(fem.Newton(problem, linear="superlu"), load)
-    assert torch.equal(answer.displacement, every.displacement)
-    assert answer.factorisations.item() == every.factorisations.item()
-
-
-def test_batch_with_reuse_solves_like_its_members(beam, pull):
-    problem = beam(NH)
-    load = load_of(torch.cat([pull(problem, q) for q in (0.0, 1e-6, 5.0, 40.0, 160.0)]))
-    solver = fem.Newton(problem, linear="superlu")
-    batch = fem.solve(solver, load)
-    for k, force in enumerate(load.force):
-        alone = fem.solve(solver, load_of(force[None]))
-        for name in ("displacement", "iterations", "factorisations", "status"):
-            assert torch.equal(getattr(batch, name)[k], getattr(alone, name)[0]), name
-    assert len(set(batch.factorisations.tolist())) > 2
-
-
 @pytest.mark.skipif("pardiso" not in fem.installed_backends(), reason="pardiso is not installed")
 def test_factorisations_of_a_batch_are_all_counted(beam, pull, monkeypatch):
     calls, original = [], Pardiso._factorise
@@ -244,24 +207,6 @@ def test_factorisations_of_a_batch_are_all_counted(beam, pull, monkeypatch):
     solver.linear_solver.factor  # noqa: B018
     monkeypatch.setattr(Pardiso, "_factorise", count)
     assert int(fem.solve(solver, load).factorisations.sum()) == len(calls)
-
-
-@pytest.mark.parametrize("reuse", [0.0, 0.1])
-def test_the_next_factor_takes_the_storage_of_an_unused_one(beam, pull, monkeypatch, reuse):
-    """Band storage needs most of the memory of a solve; two would double it."""
-    problem, places, original = beam(NH), [], BandedCholesky._cholesky
-
-    def watched(self, values):
-        factor = original(self, values)
-        places.append(self._storage.ctypes.data)
-        return factor
-
-    solver = fem.Newton(problem, linear="band", factor_reuse_tol=reuse)
-    solver.linear_solver.factor  # noqa: B018
-    monkeypatch.setattr(BandedCholesky, "_cholesky", watched)
-    answer = fem.solve(solver, load_of(pull(problem, 40.0)))
-    assert answer.factorisations.item() == len(places) >= 3
-    assert len(set(places)) == 1
 
 
 # ---- stability
@@ -337,12 +282,3 @@ def test_factor_with_negative_pivots_is_never_reused(monkeypatch, P, linear):
     assert answer.status.item() == fem.Status.UNSTABLE
     assert [count for count in met if count > 0][:2] == [2, 2]
     assert not any(used)
-
-
-def test_straight_column_far_beyond_is_the_same_with_and_without_reuse():
-    problem, unit = BODIES["SVK column"][0]()
-    for P in (2.1, 2.5, 4.0):
-        every, few = pair(problem, load_of(P * unit[None]), tol=1e-10)
-        assert few.status.item() == every.status.item() == fem.Status.UNSTABLE
-        assert few.negative_pivots.item() == every.negative_pivots.item()
-        check(every, few, fewer=False)

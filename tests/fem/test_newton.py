@@ -382,14 +382,6 @@ def test_backends_give_the_same_answer(beam, pull, name):
     assert_close(first.displacement, second.displacement, rtol=0, atol=1e-9)
 
 
-def test_solver_without_pardiso_solves_the_same(beam, pull, monkeypatch):
-    problem = beam(NH, 4, 1)
-    load = load_of(pull(problem, 20.0))
-    expected = fem.solve(newton(problem), load)
-    monkeypatch.setattr("dpl.fem.linear.backends.installed_backends", lambda: ["superlu"])
-    assert torch.equal(fem.solve(fem.Newton(problem), load).displacement, expected.displacement)
-
-
 @pytest.mark.parametrize("q", [5.0, 40.0])
 def test_mixed_points_find_the_same_answer_in_fewer_iterations(law, beam, pull, q):
     """Magisano, Leonetti, Garcea (2017)."""

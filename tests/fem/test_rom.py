@@ -2,14 +2,13 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from solving import noise, rest
 from torch.testing import assert_close
 
 from dpl import fem
-from dpl.fem.rom.ecsw import cubature, nonnegative
+from dpl.fem.rom.ecsw import cubature
 from dpl.fem.rom.pod import pod
 
 
@@ -76,22 +75,6 @@ def test_randomised_basis_is_nearly_the_best_one(monkeypatch, shape, dtype):
     )
     assert left < least * (1 + 1e-5)
     assert torch.equal(pod(fields, 6).vectors, vectors)
-
-
-def test_sparse_weights_reproduce_the_sum():
-    """400 columns in 12 dimensions: 12 of them suffice."""
-    columns = noise(12, 400).numpy()
-    columns[0] = np.abs(columns[0])
-    gram, scale = columns.T @ columns, float(np.linalg.norm(columns.sum(axis=1)))
-    target = gram.sum(axis=1)
-    for tolerance in (1e-1, 1e-3, 1e-5):
-        chosen = nonnegative(gram, target, target.sum(), tolerance, scale)
-        assert (chosen.weights > 0).all()
-        assert len(chosen.cells) <= 12
-        sums = columns[:, chosen.cells] @ chosen.weights.numpy()
-        error = np.linalg.norm(sums - columns.sum(axis=1)) / scale
-        assert error <= tolerance
-        assert chosen.error == pytest.approx(error, rel=0.1, abs=1e-7)
 
 
 def test_few_positive_weights_reproduce_the_forces_of_snapshots(newton, snapshots):

@@ -17,9 +17,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numba import float32, float64, int64, njit, void
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from torch import Tensor
+from torch.nn.functional import pad
 
 from dpl.fem.linear.dissection import Integers, nested_dissection
 from dpl.fem.linear.interface import SingularMatrix
@@ -98,15 +101,7 @@ def _inverse(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(roots.mT @ roots)
 
 
-@njit(
-    [
-        void(float32[::1], float32[:, ::1], float32[::1]),
-        void(float64[::1], float32[:, ::1], float64[::1]),
-        void(float64[::1], float64[:, ::1], float64[::1]),
-    ],
-    fastmath=True,
-    cache=True,
-)
+@njit(fastmath=True)
 def add_product(x, A, y):  # type: ignore[no-untyped-def]
     """Add x A to y, (R,), for x (F,) and A (F, R); four rows where x is zero are not read."""
     n = A.shape[1]
@@ -154,14 +149,7 @@ def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
         i += 1
 
 
-@njit(
-    [
-        void(int64[:, ::1], int64[::1], float32[::1], float32[::1], float32[::1]),
-        void(int64[:, ::1], int64[::1], float32[::1], float64[::1], float64[::1]),
-        void(int64[:, ::1], int64[::1], float64[::1], float64[::1], float64[::1]),
-    ],
-    cache=True,
-)
+@njit
 def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[no-untyped-def]
     """Set `solution` (n,) to K^-1 f.
 
@@ -232,48 +220,65 @@ def condensed_solves(table, unknowns, values, forces, solutions):  # type: ignor
             solutions[p] = 0.0
 
 
-def condensed_block_solve(fronts: Fronts, values: NDArray[Any], x: NDArray[Any]) -> None:
-    """Replace right-hand sides (n, k) by solutions, k at once.
-
-    Args:
-        fronts: See `Fronts`.
-        values: Blocks of one matrix, (V,).
-        x: Right-hand sides, (n, k), of the same dtype.
-    """
-    blocks = front_blocks(fronts, values)
-    for pivots, boundary, inverse, X in blocks:
-        own = x[pivots]
-        x[boundary] -= X.T @ own
-        x[pivots] = inverse @ own
-    for pivots, boundary, _, X in reversed(blocks):
-        x[pivots] -= X @ x[boundary]
-
-
-class FrontBlocks(NamedTuple):
-    """Blocks of one front; further axes in front of those of the blocks are matrices.
+class Layer(NamedTuple):
+    """Fronts of the same height and similar sizes, filled to one size; none depends on another.
 
     Attributes:
-        pivots: I, (I,).
-        boundary: J, (J,).
-        inverse: F_II^-1, (..., I, I).
-        coupling: X, (..., I, J).
+        pivots: Pivots of each front, n where there are fewer, (k, I).
+        boundary: Their boundaries, n where there are fewer, (k, J).
+        inverse: F_II^-1 of P matrices, zero in filled rows and columns, (P, k, I, I).
+        coupling: X, (P, k, I, J).
     """
 
-    pivots: Integers
-    boundary: Integers
-    inverse: NDArray[Any]
-    coupling: NDArray[Any]
+    pivots: Tensor
+    boundary: Tensor
+    inverse: Tensor
+    coupling: Tensor
 
 
-def front_blocks(fronts: Fronts, values: NDArray[Any]) -> list[FrontBlocks]:
-    """Return views of the blocks of each front, children first, from values (..., V)."""
-    found = []
-    for first, middle, last, place in fronts.table.tolist():
-        count, others = middle - first, last - middle
-        end = place + count * count
-        inverse = values[..., place:end].reshape(*values.shape[:-1], count, count)
-        coupling = values[..., end : end + count * others]
-        coupling = coupling.reshape(*values.shape[:-1], count, others)
-        pivots, boundary = fronts.unknowns[first:middle], fronts.unknowns[middle:last]
-        found.append(FrontBlocks(pivots, boundary, inverse, coupling))
-    return found
+def condensed_layers(blocks: Condensed, device: torch.device | str) -> list[Layer]:
+    """Return the blocks on a device, in their dtype, fronts without children first."""
+    table, _, heights = blocks.fronts
+    classes = np.rint(2 * np.log2(table[:, 1] - table[:, 0]))  # similar numbers of pivots
+    kinds = sorted(set(zip(heights.tolist(), classes.tolist(), strict=True)))
+    chosen = (np.flatnonzero((heights == h) & (classes == c)) for h, c in kinds)
+    return [Layer(*(part.to(device) for part in _layer(blocks, fronts))) for fronts in chosen]
+
+
+def solve_layers(layers: Sequence[Layer], right: Tensor) -> Tensor:
+    """Return the solutions (P, B, n) of right-hand sides (P, B, n) of the dtype of the blocks.
+
+    Each layer is a product of batches of matrices, for batches, gradients, GPUs and graphs. The
+    n-th unknown, where fronts are filled, is always zero.
+    """
+    force, inner = pad(right, (0, 1)), []
+    for layer in layers:
+        own = force[..., layer.pivots].transpose(1, 2)  # (P, k, B, I)
+        inner.append(own @ layer.inverse)
+        passed = (own @ layer.coupling).transpose(1, 2).flatten(2)
+        force = force.index_add(2, layer.boundary.flatten(), -passed)
+    solution = torch.zeros_like(force)
+    for layer, own in zip(reversed(layers), reversed(inner), strict=True):
+        outer = solution[..., layer.boundary].transpose(1, 2)
+        found = (own - outer @ layer.coupling.transpose(2, 3)).transpose(1, 2).flatten(2)
+        solution = solution.index_add(2, layer.pivots.flatten(), found)
+    return solution[..., :-1]
+
+
+def _layer(blocks: Condensed, numbers: Integers) -> Layer:
+    """Return some fronts, by their numbers."""
+    (table, unknowns, _), values = blocks
+    size, ends = len(np.unique(unknowns)), table[numbers]
+    count = int((ends[:, 1] - ends[:, 0]).max())
+    others = max(1, int((ends[:, 2] - ends[:, 1]).max()))  # graphs have no empty tensors
+    shape = len(numbers), count, others
+    pivots, boundary = np.full(shape[:2], size), np.full((len(numbers), others), size)
+    inverse = np.zeros((len(values), len(numbers), count, count), values.dtype)
+    coupling = np.zeros((len(values), *shape), values.dtype)
+    for k, (first, middle, last, place) in enumerate(ends.tolist()):
+        own, other = middle - first, last - middle
+        pivots[k, :own], boundary[k, :other] = unknowns[first:middle], unknowns[middle:last]
+        square, rest = np.split(values[:, place : place + own * (own + other)], [own * own], axis=1)
+        inverse[:, k, :own, :own] = square.reshape(-1, own, own)
+        coupling[:, k, :own, :other] = rest.reshape(-1, own, other)
+    return Layer(*map(torch.from_numpy, (pivots, boundary, inverse, coupling)))

@@ -1,7 +1,7 @@
 """Interface of the linear backends, their exception, products with symmetric matrices."""
 
 from abc import ABC, abstractmethod
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +80,11 @@ class Factor(ABC):
 
 
 class Backend(Protocol):
-    """Factorisation of matrices of one pattern, on one thread. Pickling omits the factors."""
+    """Factorisation of matrices of one pattern, on one thread. Pickling omits the factors.
+
+    A backend that refuses indefinite matrices at less cost than it factorises them has a method
+    `factorise_definite`, which raises `SingularMatrix` for them.
+    """
 
     def factorise(self, values: Array) -> Factor:
         """Return the factor of the matrix with entries `values` (nnz,) on the pattern.
@@ -89,18 +93,6 @@ class Backend(Protocol):
 
         Raises:
             SingularMatrix: A pivot is exactly zero, or entries are not finite.
-        """
-
-
-@runtime_checkable
-class DefiniteBackend(Protocol):
-    """Backend that refuses indefinite matrices at less cost than it factorises them."""
-
-    def factorise_definite(self, values: Array) -> Factor:
-        """Return the factor of a positive definite matrix, see `Backend.factorise`.
-
-        Raises:
-            SingularMatrix: The matrix is not positive definite.
         """
 
 

@@ -1,4 +1,4 @@
-"""Conjugate gradients, with diagonal or algebraic multigrid preconditioner, for large bodies."""
+"""Conjugate gradients and GMRES, and the iterative backend for large bodies."""
 
 import importlib
 import importlib.util
@@ -7,10 +7,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-from scipy.sparse import csr_matrix
+import torch
+from scipy.sparse import csr_array, csr_matrix
+from scipy.sparse.linalg import LinearOperator, gmres
+from torch import Tensor
 
 from dpl.fem.linear.interface import (
     UNKNOWN,
@@ -25,7 +28,11 @@ from dpl.fem.linear.interface import (
 )
 
 Map = Callable[[Array], Array]  # (n,) -> (n,)
+TensorMap = Callable[[Tensor], Tensor]  # (..., n) -> (..., n)
+_Step = tuple[Any, Tensor, Tensor, Tensor, Tensor]  # steps, x, residual, direction, r . z
 DEFINITENESS_TOL = 1e-6  # relative residual of a random system that proves definiteness
+MAX_STEPS = 60  # GMRES steps with the factor of the symmetric part
+CYCLES = 2  # the second one corrects what preconditioned and true residual differ by
 
 
 class NotDefinite(SingularMatrix):
@@ -62,11 +69,9 @@ def conjugate_gradients(
     Raises:
         SingularMatrix: K is not positive definite, or `max_iter` is not enough.
     """
-    largest = float(np.abs(right).max(initial=0.0))
-    if largest == 0:
+    if not right.any():
         return np.zeros_like(right)
-    unit = 2.0 ** np.clip(np.frexp(largest)[1], -1021, 1023)  # else squares under- or overflow
-    first = 0.0
+    first, unit = 0.0, binary_unit(right)
     for k, state in enumerate(krylov_steps(product, precondition, right / unit)):
         if not state.is_definite:
             raise NotDefinite("the matrix is not positive definite: negative curvature")
@@ -78,6 +83,103 @@ def conjugate_gradients(
         if is_slow or k == max_iter:
             break
     raise SingularMatrix(f"no convergence to {rtol:g} in {max_iter} conjugate gradient steps")
+
+
+def conjugate_gradients_of_tensors(
+    product: TensorMap,
+    precondition: TensorMap,
+    right: Tensor,
+    rtol: float,
+    max_steps: int,
+) -> Tensor:
+    """Return x, (..., n), with K x = f for a batch, as tensor operations.
+
+    Systems whose residual is below `rtol` are left as they are. An exported graph contains the step
+    once, in a loop.
+
+    Args:
+        product: Function x -> K x, (..., n).
+        precondition: Function r -> M^-1 r, (..., n), symmetric positive definite.
+        right: f, (..., n).
+        rtol: Norm sqrt(r . M^-1 r) of the residual over that of f at which to stop [-].
+        max_steps: Largest number of steps.
+    """
+    size = right.abs().amax(dim=-1, keepdim=True)  # squares of a scaled force do not overflow
+    size = torch.where(size > 0, size, 1.0)
+    right = (right / size).contiguous()
+    first = precondition(right).contiguous()
+    before = (right * first).sum(dim=-1, keepdim=True)
+    least = rtol**2 * before
+
+    def step(k: Any, x: Tensor, residual: Tensor, direction: Tensor, rz: Tensor) -> _Step:
+        image = product(direction)
+        is_open = rz > least
+        curvature = torch.where(is_open, (direction * image).sum(dim=-1, keepdim=True), 1.0)
+        length = torch.where(is_open, rz / curvature, 0.0)
+        x, residual = x + length * direction, residual - length * image
+        z = precondition(residual).contiguous()
+        new = (residual * z).sum(dim=-1, keepdim=True)
+        return k + 1, x, residual, z + new / torch.where(is_open, rz, 1.0) * direction, new
+
+    def is_open(k: Any, x: Tensor, residual: Tensor, direction: Tensor, rz: Tensor) -> Tensor:
+        return (k < max_steps) & (rz > least).any()
+
+    zero = torch.zeros_like(right)
+    if torch.compiler.is_compiling():
+        counter = torch.zeros((), dtype=torch.int64, device=right.device)
+        start = counter, zero, right.clone(), first.clone(), before.clone()
+        return size * cast("_Step", torch.while_loop(is_open, step, start))[1]
+    state: _Step = (0, zero, right, first, before)
+    while is_open(*state):
+        state = step(*state)
+    return size * state[1]
+
+
+def solve_unsymmetric(
+    pattern: Pattern,
+    symmetric: Array,
+    skew: Array,
+    precondition: Map,
+    right: Array,
+    rtol: float,
+    max_steps: int = MAX_STEPS,
+) -> Array:
+    """Return x, (n,), with ||right - K x|| <= rtol ||right||, by GMRES.
+
+    On bodies of 15,000 unknowns a symmetric factorisation with a few steps takes a tenth of the
+    time of an unsymmetric one by SuperLU.
+
+    Args:
+        pattern: Upper triangle of K.
+        symmetric: Entries of (K + K^T) / 2 on it, (nnz,).
+        skew: Entries of (K - K^T) / 2, (nnz,); the negative ones solve with K^T.
+        precondition: Function r -> M^-1 r, linear, near K^-1 r.
+        right: Right-hand side, (n,).
+        rtol: Relative residual at which to stop [-].
+        max_steps: Largest number of steps in a cycle, and of stored vectors.
+
+    Raises:
+        SingularMatrix: The steps are not enough, or a number is not finite.
+    """
+    shape = pattern.size, pattern.size
+    upper = csr_array((symmetric + skew, pattern.indices, pattern.indptr), shape=shape)
+    lower = csr_array((symmetric - skew, pattern.indices, pattern.indptr), shape=shape).T
+    diagonal = symmetric[pattern.indptr[:-1]]
+    matrix = LinearOperator(shape, lambda x: upper @ x + lower @ x - diagonal * x, dtype=float)
+    inverse = LinearOperator(shape, precondition, dtype=float)
+    x, failed = gmres(
+        matrix, right, M=inverse, rtol=rtol, atol=0.0, restart=max_steps, maxiter=CYCLES
+    )
+    if failed or not np.isfinite(x).all():
+        raise SingularMatrix(f"no convergence to {rtol:g} in {max_steps} GMRES steps")
+    found: Array = x
+    return found
+
+
+def binary_unit(vector: Array) -> float:
+    """Return the power of two over which squares of a vector neither under- nor overflow."""
+    largest = float(np.abs(vector).max(initial=0.0))
+    return float(2.0 ** np.clip(np.frexp(largest)[1], -1021, 1023))
 
 
 def scaled_norm(vector: Array) -> float:

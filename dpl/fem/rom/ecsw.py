@@ -1,5 +1,6 @@
 """Hyper-reduction by energy-conserving sampling and weighting (ECSW): few weighted cells."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,11 +11,10 @@ from scipy.linalg import cho_solve, solve_triangular
 from torch import Tensor
 
 from dpl.fem.assembly.follower_loads import NO_LOADS
-from dpl.fem.linear.interface import full_matrix
+from dpl.fem.linear.interface import SymmetricProduct, full_matrix
 from dpl.fem.problem import Problem
 
 Array = NDArray[np.float64]
-SMALL = 1e-5  # displacement of the central difference for K(0) u [-]
 BLOCK = 16  # states whose cell forces are in memory at a time
 
 
@@ -59,22 +59,24 @@ def cubature(
     numbers = torch.arange(len(problem.cells)) if candidates is None else candidates
     count, white = len(numbers), vectors @ whitening(problem, vectors)
     cells = ReducedMesh(problem, white, numbers, torch.ones(count, dtype=torch.float64))
-    upper = cells.at_rest()
     rows = cells.basis.view(count, -1, vectors.shape[2])
     gram, target = torch.zeros(count, count).double(), torch.zeros(count).double()
     body, basis = replace(problem, springs=None), white.flatten(0, 1)
+    if problem.moved_supports:  # they cause forces too
+        body = replace(body, free=problem.free | (problem.prescribed != 0))
+    of_cells, of_body = _linear_force(cells.problem), _linear_force(body)
     size, used = 0.0, 0
     for part in states.split(BLOCK):
         columns, totals = [], []
         for u in part:
-            values = u[cells.nodes].flatten()
-            force = cells.problem.evaluate(cells.field(values)).internal.flatten()
-            whole = body.evaluate(u[None]).internal.flatten()
-            scale = (whole @ basis).norm()
-            beyond = (force - cells.product(upper, values)).view(count, 1, -1)
+            at_cells = u[cells.nodes]
+            force = cells.problem.evaluate(at_cells[None]).internal[0]
+            whole = body.evaluate(u[None]).internal[0]
+            scale = (whole.flatten() @ basis).norm()
+            beyond = (force - of_cells(at_cells)).view(count, 1, -1)
             if scale > 0:
                 columns.append((beyond @ rows)[:, 0].T / scale)
-                totals.append((whole - _linear_force(body, u)) @ basis / scale)
+                totals.append((whole - of_body(u)).flatten() @ basis / scale)
         used += len(columns)
         if columns:
             together, total = torch.cat(columns), torch.cat(totals)
@@ -85,11 +87,10 @@ def cubature(
     return found._replace(cells=numbers[found.cells])
 
 
-def _linear_force(body: Problem, u: Tensor) -> Tensor:
-    """Return K(0) u, (N D,), of u (N, D) by a central difference, to about 1e-9."""
-    step = SMALL / float(u.abs().max())
-    pair = body.evaluate(torch.stack([step * u, -step * u])).internal
-    return (pair[0] - pair[1]).flatten() / (2 * step)
+def _linear_force(body: Problem) -> Callable[[Tensor], Tensor]:
+    """Return the function u -> K(0) u, (N, D) each, at free degrees of freedom."""
+    product = SymmetricProduct(body.pattern, body.stiffness_at_rest().numpy())
+    return lambda u: body.extend(product(body.restrict(u)))
 
 
 def nonnegative(
@@ -207,29 +208,6 @@ class ReducedMesh:
             follower_loads=NO_LOADS,
         )
         self.basis = vectors[nodes].flatten(0, 1).contiguous()
-        self._size = per_cell * dim
-        row, column = np.triu_indices(self._size)
-        self._upper = torch.from_numpy(row * self._size + column)
-        self._half = torch.from_numpy(np.where(row == column, 0.5, 1.0))
-
-    def field(self, values: Tensor) -> Tensor:
-        """Return values (C A D,) as nodal displacements (1, C A, D)."""
-        return values.view(1, *self.problem.shape)
-
-    def tangents(self, entries: Tensor) -> Tensor:
-        """Return U, (C, A D, A D), with U + U^T the cells' matrices, of their entries (nnz,)."""
-        upper = entries.new_zeros(len(entries) // len(self._upper), self._size**2)
-        upper[:, self._upper] = entries.view(-1, len(self._upper)) * self._half
-        return upper.view(-1, self._size, self._size)
-
-    def product(self, upper: Tensor, values: Tensor) -> Tensor:
-        """Return K v of v, (C A D, k) or (C A D,)."""
-        v = values.view(len(upper), self._size, -1)
-        return (upper @ v + upper.mT @ v).view_as(values)
-
-    def at_rest(self) -> Tensor:
-        """Return U, see `tangents`, of the undeformed cells."""
-        return self.tangents(self.problem.stiffness_at_rest())
 
 
 def whitening(problem: Problem, vectors: Tensor) -> Tensor:

@@ -7,8 +7,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from dpl.fem.linear.interface import full_matrix
+from dpl.fem.linear.krylov import conjugate_gradients_of_tensors
 from dpl.fem.problem import Problem
-from dpl.fem.rom.stiffness_iteration import StiffnessIteration, conjugate_gradients
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 
 EXACT = 1e-12  # relative error of reduced solutions [-]
@@ -25,17 +25,16 @@ class ReducedStiffness:
         parts: A_1, ..., A_T and C, (T + 1, R, R + 1).
     """
 
-    def __init__(self, parts: Tensor, iteration: StiffnessIteration) -> None:
+    def __init__(self, parts: Tensor, terms: StiffnessTerms) -> None:
         """Compute the inverse of the node.
 
         Args:
             parts: See `reduced_terms`.
-            iteration: Node of the whole matrix. A projection has no larger condition number than
+            terms: Terms of the whole matrix. A projection has no larger condition number than
                 K(node)^-1 K(0).
         """
-        self.parts, self._iteration = parts, iteration
-        node = torch.tensor([iteration.node], dtype=torch.float64)
-        self._inverse = torch.linalg.inv_ex(self.at(node.to(parts))[0, :, :-1]).inverse
+        self.parts, self._steps = parts, 4 * terms.bound if terms.varies else 0
+        self._inverse = torch.linalg.inv_ex(self.at(terms.node.to(parts))[0, :, :-1]).inverse
 
     def solve(self, factors: Tensor, right: Tensor) -> Tensor:
         """Return the coordinates (B, R) of Galerkin linear solutions.
@@ -51,14 +50,14 @@ class ReducedStiffness:
         factors = pad(factors.to(right).expand(right.shape[0], -1), (0, 1), value=1.0)
         parts, inverse = self.parts.to(right), self._inverse.to(right)
         right = right - factors @ parts[..., -1]
-        if not self._iteration.varies:
+        if not self._steps:
             return right @ inverse
 
         def product(x: Tensor) -> Tensor:
             return torch.einsum("bk,bi,kij->bj", factors, x, parts[..., :-1])
 
-        steps = 4 * self._iteration.bound
-        return conjugate_gradients(product, lambda r: r @ inverse, right, EXACT, steps)
+        maps = product, lambda r: r @ inverse
+        return conjugate_gradients_of_tensors(*maps, right, EXACT, self._steps)
 
     def inverse(self, factors: Tensor) -> ReducedInverse:
         """Return (V^T K(0) V)^-1, (R, R), and V^T K(0) p, (R,), of factors (1, T)."""

@@ -118,13 +118,9 @@ class SampledTangent:
     def _at_rest(self, law: Material) -> Array:
         """Return W^T K(0) W, (R, R), of a law of the body."""
         if not self.problem.material.parameter_ranges:
-            return self._one
+            return np.eye(len(self.scale))
         factors = np.append(self._terms.factors(law)[0].numpy(), 1.0)
         return np.tensordot(factors, self._reduced_terms, 1)
-
-    @cached_property
-    def _one(self) -> Array:
-        return np.eye(len(self.scale))
 
     @cached_property
     def _reduced_terms(self) -> Array:

@@ -18,7 +18,11 @@ from dpl.fem.rom.ecsw import Cubature, cubature, refuse_follower_loads
 from dpl.fem.rom.sampled_tangent import Array, SampledTangent, Single
 from dpl.fem.solvers.solution import Load, Solution, check_tol, evaluate_solution, run_lockstep
 
+MIN_DAMPING = 2.0**-4  # smallest damping factor [-]
+MIN_DETF_RATIO = 0.2  # a step must leave this part of min det F [-]
 LEAST_EIGENVALUE = 1e-2  # of an indefinite reduced tangent relative to that at rest [-]
+
+_Correction = tuple[Array, Callable[[Array], Array]]  # coordinates in W, (R,); inverse tangent
 
 
 class SubspaceState(NamedTuple):
@@ -75,8 +79,6 @@ class SubspaceNewton:
         error_tol: Estimated relative error within the subspace at which the steps end [-]. Products
             with V in float32 resolve errors down to about 1e-7.
         max_iter: Largest number of steps.
-        min_damping: Smallest damping factor [-].
-        min_detF_ratio: As of `Newton`: a step must leave this part of min det F [-].
 
     Raises:
         ValueError: V does not fit the body, an attribute is out of range, or, at the first load,
@@ -89,8 +91,6 @@ class SubspaceNewton:
     tol: float = 1e-8
     error_tol: float = 2e-5
     max_iter: int = 4
-    min_damping: float = 2.0**-4
-    min_detF_ratio: float = 0.2
 
     @classmethod
     def within(
@@ -117,9 +117,8 @@ class SubspaceNewton:
     def __post_init__(self) -> None:
         refuse_follower_loads(self.problem, type(self).__name__)
         check_tol(self.tol)
-        for name in ("error_tol", "min_damping", "min_detF_ratio"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} = {getattr(self, name)} must be above 0 and at most 1")
+        if not 0 < self.error_tol <= 1:
+            raise ValueError(f"error_tol = {self.error_tol} must be above 0 and at most 1")
         if self.max_iter < 0:
             raise ValueError(f"max_iter = {self.max_iter} must be 0 or more")
         if self.vectors.ndim != 3 or tuple(self.vectors.shape[:2]) != self.problem.shape:
@@ -128,32 +127,22 @@ class SubspaceNewton:
         if self.vectors[~self.problem.free].any():
             raise ValueError("vectors must be zero at fixed degrees of freedom")
 
-    def iterate(
-        self, load: Load, *, guess: Tensor | None = None, evaluation: Evaluation | None = None
-    ) -> Iterator[Solution]:
+    def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
         """Yield the guess and the state after each step; loads in lockstep.
 
         Args:
             load: The load.
             guess: Displacement to start from, (B, N, D) [-]; None: zero, except at supports.
-            evaluation: Internal force and min det F at the guess, if known. The guess must then
-                have the displacement of the supports.
         """
         loads = load.unbatch()
         if guess is None:
             guess = self.problem.prescribed.expand(len(loads), -1, -1)
-        known: list[Evaluation | None] = [None] * len(loads)
-        if evaluation is not None:
-            parts = (part.split(1) for part in evaluation)
-            known = [Evaluation(*pair) for pair in zip(*parts, strict=True)]
-        triples = zip(loads, guess.split(1), known, strict=True)
-        yield from run_lockstep([self._solutions(*triple) for triple in triples])
+        pairs = zip(loads, guess.split(1), strict=True)
+        yield from run_lockstep([self._solutions(single, u) for single, u in pairs])
 
-    def _solutions(
-        self, load: Load, guess: Tensor, evaluation: Evaluation | None
-    ) -> Iterator[Solution]:
+    def _solutions(self, load: Load, guess: Tensor) -> Iterator[Solution]:
         start = time.perf_counter()
-        for state in self.states(load, guess=guess, evaluation=evaluation):
+        for state in self.states(load, guess=guess):
             count = state.iterations
             solution = evaluate_solution(
                 self.problem, state.displacement, load, self.tol,
@@ -179,7 +168,10 @@ class SubspaceNewton:
         Residual norms and status are not computed.
 
         Args:
-            load, guess, evaluation: As of `iterate`, B = 1.
+            load: The load, B = 1.
+            guess: Displacement to start from, (1, N, D) [-].
+            evaluation: Internal force and min det F at the guess, if known. The guess must then
+                have the displacement of the supports.
             error_tol, max_iter: Replace the attributes of the solver.
             is_over: Called before each evaluation of the residual and each tangent of all cells.
                 If it returns True, a step ends, and the states do after the last complete step.
@@ -197,7 +189,7 @@ class SubspaceNewton:
         state = SubspaceState(guess, evaluation, math.inf, 0)
         correction = self._correction(problem, load, state)
         if correction is not None:
-            state = state._replace(error=self._relative(correction.y, guess))
+            state = state._replace(error=self._relative(correction[0], guess))
         yield state
         best = state
         while correction is not None and not is_last(state):
@@ -216,52 +208,9 @@ class SubspaceNewton:
         if best is not state:
             yield best._replace(iterations=state.iterations)
 
-    def correct(
-        self,
-        force: Tensor,
-        guess: Tensor,
-        *,
-        parameters: Tensor | None = None,
-        steps: int | None = None,
-    ) -> Tensor:
-        """Return the last displacement (N, D) of `states` from a guess (N, D).
-
-        Args:
-            force: Nodal force, (N, D) [-].
-            guess: Displacement, (N, D) [-].
-            parameters: Values of `Problem.parameter_ranges`, (P,); may be left out if there are
-                none.
-            steps: Largest number of steps; None: `max_iter`.
-        """
-        values = None if parameters is None else parameters[None]
-        load = Load(force[None], torch.ones(1, dtype=torch.float64), values)
-        *_, last = self.states(load, guess=guess[None], max_iter=steps)
-        return last.displacement[0]
-
-    def correction(
-        self, load: Load, displacement: Tensor, evaluation: Evaluation | None = None
-    ) -> tuple[Tensor, float]:
-        """Return Newton's correction V s, (N, D) [-], and ||s|| / ||u|| [-], without evaluating it.
-
-        The latter estimates the relative error within the subspace. It is infinite, and the
-        correction zero, where an element is inverted.
-
-        Args:
-            load: The load, B = 1.
-            displacement: u, (1, N, D) [-].
-            evaluation: Internal force and min det F at u, if known.
-        """
-        problem = self.problem.with_parameters(load.parameters)
-        evaluation = evaluation or problem.evaluate(displacement)
-        state = SubspaceState(displacement, evaluation, math.inf, 0)
-        correction = self._correction(problem, load, state)
-        if correction is None:
-            return torch.zeros_like(displacement[0]), math.inf
-        return self._update(correction.y), self._relative(correction.y, displacement)
-
     def _correction(
         self, problem: Problem, load: Load, state: SubspaceState, *, whole: bool = False
-    ) -> "_Correction | None":
+    ) -> _Correction | None:
         """Return Newton's correction; None where an element is inverted.
 
         `whole` stands for the tangent of all cells.
@@ -272,26 +221,27 @@ class SubspaceNewton:
         tangent = self.tangent.at(problem, state.displacement[0], whole=whole)
         solve = _factorised(tangent)
         y = solve(right)
-        return _Correction(y, solve) if np.isfinite(y).all() else None
+        return (y, solve) if np.isfinite(y).all() else None
 
     def _step(
         self,
         problem: Problem,
         load: Load,
         state: SubspaceState,
-        correction: "_Correction",
+        correction: _Correction,
         is_over: Callable[[], bool],
     ) -> SubspaceState | None:
         """Return the state after the longest acceptable step, None if none was found in time."""
-        size, update = self._norm(correction.y), self._update(correction.y)
-        lowest = self.min_detF_ratio * min(float(state.evaluation.volume_ratio), 1.0)
+        full, solve = correction
+        size, update = self._norm(full), self._update(full)
+        lowest = MIN_DETF_RATIO * min(float(state.evaluation.volume_ratio), 1.0)
         damping = 1.0
-        while damping >= self.min_damping and not is_over():
+        while damping >= MIN_DAMPING and not is_over():
             u = state.displacement + damping * update
             evaluation = problem.evaluate(u)
             if evaluation.volume_ratio > lowest:
                 right = self._reduced_residual(load, evaluation)
-                y = None if right is None else correction.solve(right)
+                y = None if right is None else solve(right)
                 if y is not None and self._norm(y) < (1 - damping / 4) * size:
                     return SubspaceState(u, evaluation, self._relative(y, u), state.iterations + 1)
             damping /= 2
@@ -327,13 +277,6 @@ class SubspaceNewton:
     def __getstate__(self) -> dict[str, object]:
         """Pickle without cached properties."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
-
-
-class _Correction(NamedTuple):
-    """Newton's correction in coordinates of W, (R,), and the inverse of its tangent."""
-
-    y: Array
-    solve: Callable[[Array], Array]
 
 
 def _factorised(matrix: Array) -> Callable[[Array], Array]:

@@ -1,6 +1,7 @@
 """Anderson acceleration of a fixed-point iteration with the corotated inverse of K(0)."""
 
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -9,11 +10,9 @@ import torch
 from torch import Tensor
 
 from dpl.fem.linear.interface import Array
-from dpl.fem.linear.krylov import scaled_norm
-from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status, evaluate_solution, run_lockstep
+from dpl.fem.solvers.solution import Load, Solution, evaluate_solution, run_lockstep
 
 WINDOW = 5  # iterations in which the residual has to halve
 
@@ -40,16 +39,6 @@ class AndersonSolver:
     memory: int = 12
     max_iter: int = 30
 
-    @property
-    def problem(self) -> Problem:
-        """The body."""
-        return self.newton.problem
-
-    @property
-    def tol(self) -> float:
-        """Relative residual below which a solution counts as converged [-]."""
-        return self.newton.tol
-
     def iterate(self, load: Load, *, guess: Tensor) -> Iterator[Solution]:
         """Yield the guess and the state after each iteration; loads in lockstep.
 
@@ -65,73 +54,41 @@ class AndersonSolver:
         start, newton = time.perf_counter(), self.newton.with_parameters(load.parameters)
         problem = newton.problem
         u = torch.where(problem.free, guess, problem.prescribed)
-        evaluation = problem.evaluate(u)
-        state = evaluate_solution(
-            self.problem, u, load, self.tol,
-            seconds=time.perf_counter() - start, from_guess=True, evaluation=evaluation,
-        )  # fmt: skip
-        yield state
-        if state.converged or not state.volume_ratio > 0:
-            return
-        factor = newton.linear_solver.corotational.at(u)
-        right = problem.restrict(load.force[0] - evaluation.internal[0])
-        residuals = [float(state.residual)]
-        size = scaled_norm(right) / residuals[0]  # of the loads
-        history = _History(self.memory, len(right))
-        for count in range(1, self.max_iter + 1):
-            step = history.step(right, factor)
-            u = u + problem.extend(step)[None]
-            evaluation, before = problem.evaluate(u), right
-            right = problem.restrict(load.force[0] - evaluation.internal[0])
-            if problem.moved_supports:  # the reactions are loads too
-                residual = float(problem.relative_residual_of(evaluation.internal, load.force))
-            else:
-                residual = scaled_norm(right) / size
-            residuals.append(residual)
-            is_valid = float(evaluation.volume_ratio) > 0
-            balanced = is_valid and residual < self.tol
-            status = Status.CONVERGED if balanced else Status.NOT_CONVERGED
-            yield state._replace(
-                displacement=u,
-                residual=torch.tensor([residual], dtype=torch.float64),
-                volume_ratio=evaluation.volume_ratio,
-                status=torch.tensor([int(status)]),
-                iterations=torch.tensor([count]),
-                load_factor=torch.tensor([float(balanced)], dtype=torch.float64),
-                seconds=torch.tensor([time.perf_counter() - start], dtype=torch.float64),
-            )
-            diverges = not is_valid or not residual < 10 * residuals[0]
-            slow = count >= WINDOW and not min(residuals[-WINDOW:]) < 0.5 * residuals[-WINDOW - 1]
-            if balanced or diverges or slow:
+        factor: CorotatedFactor | None = None
+        residuals: list[float] = []
+        right = step = np.zeros(0)
+        steps, changes = (deque[Array](maxlen=self.memory) for _ in range(2))
+        for count in range(self.max_iter + 1):
+            evaluation = problem.evaluate(u)
+            seconds = time.perf_counter() - start
+            state = evaluate_solution(
+                self.newton.problem, u, load, newton.tol,
+                iterations=count, seconds=seconds, from_guess=True, evaluation=evaluation,
+            )  # fmt: skip
+            yield state
+            residuals.append(float(state.residual))
+            is_slow = count >= WINDOW and not min(residuals[-WINDOW:]) < residuals[-1 - WINDOW] / 2
+            diverges = not state.volume_ratio > 0 or not residuals[-1] < 10 * residuals[0]
+            if state.converged or diverges or is_slow:
                 return
-            history.add(step, right - before)
+            before, right = right, problem.restrict(load.force[0] - evaluation.internal[0])
+            if factor is None:
+                factor = newton.linear_solver.corotational.at(u)
+            else:
+                steps.append(step)
+                changes.append(right - before)
+            step = _step(right, list(steps), list(changes), factor)
+            u = u + problem.extend(step)[None]
 
 
-class _History:
-    """Last steps, the changes of the residual that they caused, and the changes' Gram matrix."""
+def _step(right: Array, steps: list[Array], changes: list[Array], factor: CorotatedFactor) -> Array:
+    """Return the step (n,) from the combination of iterates with the smallest residual.
 
-    def __init__(self, memory: int, size: int) -> None:
-        """Allocate `memory` steps (n,)."""
-        self.steps, self.changes = np.empty((memory, size)), np.empty((memory, size))
-        self.gram = np.empty((memory, memory))
-        self.count = 0
-
-    def add(self, step: Array, change: Array) -> None:
-        """Store a step and its change of the residual, in place of the oldest if full."""
-        row = self.count % len(self.steps)
-        self.steps[row], self.changes[row] = step, change
-        self.count += 1
-        n = min(self.count, len(self.steps))
-        self.gram[row, :n] = self.gram[:n, row] = self.changes[:n] @ change
-
-    def step(self, right: Array, factor: CorotatedFactor) -> Array:
-        """Return the step (n,) from the combination of iterates with the smallest residual.
-
-        The residual at the last iterate is `right` (n,); the factor is that of M.
-        """
-        n = min(self.count, len(self.steps))
-        if not n:
-            return factor.apply(right)
-        steps, changes = self.steps[:n], self.changes[:n]
-        weights = np.linalg.lstsq(self.gram[:n, :n], changes @ right, rcond=1e-13)[0]
-        return factor.apply(right - weights @ changes) - weights @ steps
+    `right` is the residual at the last iterate; `changes` are those of the residual by each of the
+    last steps.
+    """
+    if not steps:
+        return factor.apply(right)
+    S, C = np.stack(steps), np.stack(changes)
+    weights = np.linalg.lstsq(C @ C.T, C @ right, rcond=1e-13)[0]
+    return factor.apply(right - weights @ C) - weights @ S

@@ -7,7 +7,6 @@ import torch
 from scipy.sparse.linalg import LinearOperator, eigsh
 from torch import Tensor
 
-from dpl.fem.linear.backends import make_backend
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load, Solution
@@ -30,7 +29,7 @@ def unstable_directions(newton: Newton, solution: Solution) -> Tensor:
         raise ValueError("the solution has no negative pivots: there is no unstable direction")
     problem = newton.problem
     values = problem.linearise(solution.displacement).tangent[0].numpy()
-    factor = make_backend(problem.pattern, newton.linear).factorise(values)
+    factor = newton.linear_solver.tangent_backend.factorise(values)
     size = problem.pattern.size
     inverse = LinearOperator((size, size), matvec=factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(size)

@@ -4,9 +4,9 @@ Under large rotations and small strains the tangent is close to K(0) in the rota
 nodes (stiffness warping).
 """
 
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 from numba import float64, int64, njit, void
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
-from dpl.fem.linear.interface import Array, Factor, SingularMatrix, SymmetricProduct
-from dpl.fem.linear.krylov import conjugate_gradients, smallest_ritz_value
+from dpl.fem.linear.interface import Array, Factor, SymmetricProduct
+from dpl.fem.linear.krylov import krylov_steps, smallest_ritz_value
 from dpl.fem.problem import Problem
 
 MAX_POLAR_ITER = 20  # of a polar decomposition; near a rotation it takes three iterations
@@ -67,18 +67,12 @@ class CorotationalPreconditioner:
 
         The right-hand side is random; the result is at most `max_iter`.
         """
-        product = self._tangent(displacement)
         right = np.random.default_rng(0).standard_normal(self.problem.pattern.size)
-        factor, calls = self.at(displacement), []
-
-        def apply(residual: Array) -> Array:
-            calls.append(residual)
-            return factor.apply(residual)
-
-        with suppress(SingularMatrix):
-            conjugate_gradients(product, apply, right, rtol, max_iter)
-            return len(calls)
-        return max_iter
+        product, factor = self._tangent(displacement), self.at(displacement)
+        steps = islice(krylov_steps(product, factor.apply, right), max_iter)
+        enough = rtol * np.linalg.norm(right)
+        small = (k for k, step in enumerate(steps) if np.linalg.norm(step.residual) <= enough)
+        return next(small, max_iter)
 
     def smallest_ritz_value(self, displacement: Tensor) -> float:
         """Return the smallest Ritz value of this inverse times the tangent at (1, N, D) [-]."""
@@ -126,11 +120,6 @@ class CorotatedFactor(Factor):
     factor: Factor
     rotations: Array
     numbers: NDArray[np.int64]
-
-    @property
-    def negative_pivots(self) -> int | None:
-        """Negative pivots of K(0)."""
-        return self.factor.negative_pivots
 
     def apply(self, right: Array) -> Array:
         """Return R M R^T right, (n,), M the inverse of K(0) or its preconditioner."""

@@ -1,6 +1,5 @@
 """Equilibrium as a differentiable function of load and parameters, by one adjoint solve each."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -9,13 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dpl.fem.linear.interface import Array
-from dpl.fem.linear.unsymmetric import solve_unsymmetric
-from dpl.fem.problem import System
+from dpl.fem.linear.krylov import Map, solve_unsymmetric
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load, Solution, Status
-
-Map = Callable[[Array], Array]  # (n,) -> (n,)
 
 ADJOINT_TOL = 1e-12  # relative residual of an adjoint solve with an unsymmetric tangent [-]
 
@@ -65,27 +60,18 @@ class DifferentiableSolve:
             *_, last = self.newton.iterate(load, guess=guess)
         return last
 
-    def adjoints(self, displacement: Tensor, parameters: Tensor | None = None) -> list[Map]:
-        """Return the functions g -> K(u)^-T g, (n,) to (n,), at displacements (B, N, D) [-].
+    def adjoint(self, displacement: Tensor, parameters: Tensor) -> Map:
+        """Return the function g -> K(u)^-T g, (n,) to (n,).
 
         Args:
-            displacement: Displacements of the tangents.
-            parameters: Values of `Problem.parameter_ranges`, (B, P).
+            displacement: u, (1, N, D) [-].
+            parameters: Values of `Problem.parameter_ranges`, (1, P).
 
         Raises:
-            SingularMatrix: A tangent is singular.
+            SingularMatrix: The tangent is singular.
         """
-        problem = self.newton.problem
-        if parameters is None:
-            parameters = displacement.new_zeros(len(displacement), 0)
-        systems = [
-            problem.with_parameters(own).linearise(u)
-            for u, own in zip(displacement.split(1), parameters.split(1), strict=True)
-        ]
-        return [self._adjoint(system) for system in systems]
-
-    def _adjoint(self, system: System) -> Map:
         linear = self.newton.linear_solver
+        system = self.newton.problem.with_parameters(parameters).linearise(displacement)
         values = system.tangent[0].numpy()
         factor = linear.tangent_backend.factorise(values)
         if system.skew is None:
@@ -122,7 +108,9 @@ class _Equilibrium(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
         problem, (displacement,) = ctx.parent.newton.problem, ctx.saved_tensors
         if ctx.adjoints is None:  # kept: each row of a Jacobian needs them
-            ctx.adjoints = ctx.parent.adjoints(displacement, ctx.parameters)
+            parameters = ctx.parameters.expand(len(displacement), -1)
+            pairs = zip(displacement.split(1), parameters.split(1), strict=True)
+            ctx.adjoints = [ctx.parent.adjoint(*pair) for pair in pairs]
         solved = [
             problem.extend(adjoint(problem.restrict(one)))
             for adjoint, one in zip(ctx.adjoints, gradient, strict=True)

@@ -7,7 +7,7 @@ import numpy as np
 from torch import Tensor
 
 from dpl.fem.linear.interface import Array
-from dpl.fem.linear.krylov import krylov_steps, scaled_norm
+from dpl.fem.linear.krylov import binary_unit, krylov_steps, scaled_norm
 from dpl.fem.problem import Evaluation
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
@@ -89,8 +89,7 @@ def estimate_error(
         moved = problem.evaluate(displacement + length * problem.extend(direction)[None])
         return problem.restrict((moved.internal - internal)[0]) / length
 
-    largest = float(np.abs(right).max(initial=0.0))
-    unit = 2.0 ** np.clip(np.frexp(largest)[1], -1021, 1023)
+    unit = binary_unit(right)
     steps = krylov_steps(product, lambda part: inverse.solve(part, RTOL), right / unit)
     first = 0.0
     for k, step in enumerate(steps):
@@ -100,13 +99,13 @@ def estimate_error(
         ritz = step.ritz
         if not ritz > 0:
             is_near = bool(problem.relative_residual_of(internal, load.force) < NEAR)
-            error = math.inf if is_near else DOUBT * float(unit * first) / size
+            error = math.inf if is_near else DOUBT * unit * first / size
             return ErrorEstimate(error, correction, is_indefinite=is_near)
         least, length = min(ritz, 1.0), scaled_norm(step.solution)
         rest = scaled_norm(step.preconditioned) / least
         if size == 0 or k == products or rest <= REST * length:
             break
-    if k and float(unit * (length + rest)) > LINEAR * size:
+    if k and unit * (length + rest) > LINEAR * size:
         better = problem.evaluate(displacement + correction)
         left = problem.restrict((load.force - better.internal)[0]) / unit
         if not bool(better.volume_ratio > 0):
@@ -115,4 +114,4 @@ def estimate_error(
     distance = (2 - least) * (length + rest)
     if size == 0:
         return ErrorEstimate(math.inf if distance else 0.0, correction)
-    return ErrorEstimate(float(unit * distance) / size, correction)
+    return ErrorEstimate(unit * distance / size, correction)

@@ -8,14 +8,11 @@ from dpl.fem.linear.interface import (
     UNKNOWN,
     Array,
     Backend,
-    DefiniteBackend,
     Factor,
-    Pattern,
     SingularMatrix,
     SymmetricProduct,
 )
-from dpl.fem.linear.krylov import conjugate_gradients, smallest_ritz_value
-from dpl.fem.linear.unsymmetric import solve_unsymmetric
+from dpl.fem.linear.krylov import conjugate_gradients, smallest_ritz_value, solve_unsymmetric
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.linear import LinearSolver
 
@@ -37,16 +34,12 @@ class TangentSolver:
     def __init__(self, linear_solver: LinearSolver, *, corotational: bool) -> None:
         """Start without a factor; `corotational` allows the corotated factor of K(0)."""
         self.linear_solver, self.backend = linear_solver, linear_solver.tangent_backend
-        self.factorisations = 0
+        self.factorisations, self._pattern = 0, linear_solver.problem.pattern
         self._corotational = corotational
         self._factor: Factor | None = None  # of the last solve
         self._rest: Factor | None = None  # that of K(0), once used
         self._corotated: Factor | None = None  # the same rotated, once used
         self._tangent: SymmetricProduct | None = None  # last one, if it was not factorised
-
-    @property
-    def _pattern(self) -> Pattern:
-        return self.linear_solver.problem.pattern
 
     def solve(
         self,
@@ -91,13 +84,13 @@ class TangentSolver:
                     self._tangent, apply, right, rtol, steps, abort_if_slow=corotated
                 )
             self._corotational &= not corotated
-            del apply, factor  # the next factor takes the storage of this one
+            del apply, factor  # free their storage before the next factorisation
         self._factor, self._tangent = None, None
         self.factorisations += 1
-        if definite and isinstance(self.backend, DefiniteBackend):
-            self._factor = self.backend.factorise_definite(tangent)
-        else:
-            self._factor = self.backend.factorise(tangent)
+        factorise = self.backend.factorise
+        if definite:
+            factorise = getattr(self.backend, "factorise_definite", factorise)
+        self._factor = factorise(tangent)
         if definite and self._factor.negative_pivots:
             raise SingularMatrix("the tangent is indefinite")
         if skew is not None:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -110,13 +111,6 @@ class LinearSolver:
             self._clones[problem] = replace(self, problem=problem, parent=self)
         return self._clones[problem]
 
-    def with_prescribed(self, prescribed: Tensor) -> "LinearSolver":
-        """Return the solver of the body with other displacements (N, D) [-] of its supports.
-
-        K(0) does not depend on them, and its factors are shared.
-        """
-        return replace(self, problem=replace(self.problem, prescribed=prescribed), parent=self)
-
     def forget_clones(self) -> None:
         """Drop the solvers of other parameters, so that their factors are computed again."""
         self._clones.clear()
@@ -162,3 +156,31 @@ class LinearSolver:
     def __getstate__(self) -> dict[str, object]:
         """Pickle without the factor."""
         return {"problem": self.problem, "tol": self.tol, "linear": self.linear}
+
+
+@runtime_checkable
+class ReferenceSolver(Protocol):
+    """Solver of a scene. Data sets and comparisons hold its solutions.
+
+    Any class with these attributes can be the solver of a scene. The configuration calls it with
+    the keyword `problem`. A load brings its own parameters where the law has ranges:
+    `problem.with_parameters(load.parameters)` is its body.
+    """
+
+    @property
+    def problem(self) -> Problem:
+        """Body."""
+
+    @property
+    def tol(self) -> float:
+        """Relative residual below which a solution counts as converged [-]."""
+
+    @property
+    def linear_solver(self) -> LinearSolver:
+        """Linear solver with the factor of K(0) that the whole scene shares."""
+
+    def iterate(self, load: Load) -> Iterator[Solution]:
+        """Yield the solutions of the iterations; the last one is the result."""
+
+    def identity(self) -> dict[str, Any]:
+        """Return the options that determine the solutions, as plain data."""

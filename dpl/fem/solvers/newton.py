@@ -7,7 +7,7 @@ import math
 import time
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -18,7 +18,6 @@ from dpl.fem.linear.interface import UNKNOWN, SingularMatrix
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.factor_reuse import TangentSolver, forcing_term, stability_at
 from dpl.fem.solvers.linear import LinearSolver
-from dpl.fem.solvers.load_stepping import LoadStepping, longest_valid_step
 from dpl.fem.solvers.solution import Load, Solution, Status, check_force, check_tol, run_lockstep
 
 FULL_TOL_STEP = 2.0**-4  # load step below which intermediate states are solved to `tol` [-]
@@ -218,18 +217,17 @@ class Newton:
 
     def _update(self, state: "_State", update: Tensor, *, halvings: int) -> "_State | None":
         """Return the state after the longest of the steps 1, 1/2, ... that inverts no element."""
-
-        def state_after(length: float) -> _State:
-            u = state.displacement + length * update
-            return self._evaluate(u, (1 - length) * state.support_step)._replace(length=length)
-
         bound = self.min_detF_ratio * min(float(state.volume_ratio), 1.0)
-        new = longest_valid_step(state_after, bound, halvings=halvings)
-        if new is None or not (self.mixed_integration and self.problem.material.has_response):
-            return new
-        u = new.displacement
-        gap = self.problem.update_strain_gap(state.gap, new.length, update, u)
-        return new._replace(gap=gap)
+        for length in (0.5**k for k in range(halvings + 1)):
+            u = state.displacement + length * update
+            new = self._evaluate(u, (1 - length) * state.support_step)
+            if new.volume_ratio > bound:
+                break
+        else:
+            return None
+        if self.mixed_integration and self.problem.material.has_response:
+            new = new._replace(gap=self.problem.update_strain_gap(state.gap, length, update, u))
+        return new
 
     def _initial(self, force: Tensor, guess: Tensor | None) -> "_State | None":
         """Return the state of a guess; None where it is zero, inverted or there is no load."""
@@ -298,9 +296,40 @@ class Newton:
             from_guess=torch.tensor([run.from_guess]),
         )
 
-    def __getstate__(self) -> dict[str, object]:
-        """Pickle without factors."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+@dataclass
+class LoadStepping:
+    """Load factors of an incremental solution: a failed step is halved, the next one doubled.
+
+    Source: Wriggers (2008), Nonlinear Finite Element Methods, section 5.3.
+
+    Attributes:
+        min_step: Load step below which the solution is given up [-].
+        factor: Largest load factor for which an equilibrium is known [-].
+        step: Load step that is tried next [-].
+    """
+
+    min_step: float
+    factor: float = 0.0
+    step: float = 1.0
+
+    @property
+    def target(self) -> float:
+        """Load factor at the end of the next step [-], 1 for the whole load."""
+        return min(self.factor + self.step, 1.0)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the next step is below the smallest one allowed."""
+        return self.step < self.min_step
+
+    def accept(self) -> None:
+        """Advance to the target and double the step."""
+        self.factor, self.step = self.target, 2 * self.step
+
+    def reject(self) -> None:
+        """Halve the step."""
+        self.step = (self.target - self.factor) / 2
 
 
 class _State(NamedTuple):
@@ -313,7 +342,6 @@ class _State(NamedTuple):
         support_step: Displacement that the next step has to add at the supports, (1, N, D) [-].
         residuals: Relative residuals by load factor.
         gap: Strain gap of the mixed integration points, see `Problem.update_strain_gap`.
-        length: Length of the last step, 1 for a full one.
         previous: Relative residual before that step [-].
     """
 
@@ -323,7 +351,6 @@ class _State(NamedTuple):
     support_step: Tensor
     residuals: dict[float, float]
     gap: Any = None
-    length: float = 1.0
     previous: float = math.inf
 
 

@@ -10,19 +10,22 @@ from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import block_diag, coo_array, csr_array
 from torch import Tensor
 
 from dpl.fem.linear.condensation import (
     Condensed,
     condense,
-    condensed_block_solve,
+    condensed_layers,
     condensed_solves,
+    solve_layers,
 )
 from dpl.fem.linear.interface import Array, Factor, full_matrix
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
+from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import SymmetryGroup
 
 
@@ -101,12 +104,9 @@ class ParityFactor(Factor):
         size = np.abs(right).max(axis=1, keepdims=True, initial=0)  # of order one in float32
         size[size == 0] = 1
         images, signs, scales, characters = self._arrays
-        parts = characters @ (scales * (right / size)[:, images])  # (k, M, m)
-        solved = np.empty_like(parts)
-        for p, values in enumerate(self.blocks.values):
-            own = np.ascontiguousarray(parts[:, p].T, np.float32)
-            condensed_block_solve(self.blocks.fronts, values, own)
-            solved[:, p] = own.T
+        parts = torch.from_numpy(characters @ (scales * (right / size)[:, images]))  # (k, M, m)
+        layers = condensed_layers(self.blocks, "cpu")
+        solved = solve_layers(layers, parts.transpose(0, 1).float()).transpose(0, 1).numpy()
         x = np.empty_like(right)
         x[:, images] = signs * (characters.T @ solved)
         return x * size
@@ -133,3 +133,53 @@ def _block(whole: csr_array, orbits: SignedOrbits, characters: Tensor) -> csr_ar
     missing = np.flatnonzero(squares < 1e-6)
     ones = coo_array((np.ones(len(missing)), (missing, missing)), shape=(count, count))
     return (fields.T @ whole @ fields + ones).tocsr()
+
+
+class TermMatrices(NamedTuple):
+    """Terms of K(0) by parity as sparse matrices of one structure: n equations of all parities.
+
+    Attributes:
+        first_entry, columns: CSR structure, (n + 1,) and (nnz,).
+        entries: Entries of the T terms and of the springs, (T + 1, nnz).
+    """
+
+    first_entry: NDArray[np.int32]
+    columns: NDArray[np.int32]
+    entries: Array
+
+    @classmethod
+    def of(cls, terms: StiffnessTerms, form: OrbitForm) -> Self:
+        """Return the terms of a body. The springs are what the terms of the node lack."""
+        bodies = [*terms.bodies, terms.node_body]
+        every = [block_diag(form.matrices(body), format="csr") for body in bodies]
+        structure = csr_array(sum(abs(one) for one in every))
+        structure.sort_indices()
+        entries = np.stack([_entries(one, structure) for one in every])
+        entries[-1] -= terms.node[0].numpy() @ entries[:-1]
+        return cls(structure.indptr, structure.indices, entries)
+
+    def at(self, factors: Array) -> csr_array:
+        """Return K(0), (n, n), of factors and 1, (T + 1,)."""
+        return csr_array((factors @ self.entries, self.columns, self.first_entry))
+
+    def padded(self) -> tuple[Tensor, Tensor]:
+        """Return columns (n, w) and entries (T + 1, n, w) in rows of one length w."""
+        lengths = np.diff(self.first_entry)
+        rows = np.repeat(np.arange(len(lengths)), lengths)
+        place = np.arange(len(rows)) - self.first_entry[rows]
+        columns = np.zeros((len(lengths), lengths.max()), np.int64)
+        columns[rows, place] = self.columns
+        entries = np.zeros((len(self.entries), *columns.shape))
+        entries[:, rows, place] = self.entries
+        return torch.from_numpy(columns), torch.from_numpy(entries)
+
+
+def _entries(matrix: csr_array, structure: csr_array) -> Array:
+    """Return the entries of a matrix in the order of a structure that contains its own."""
+    size = structure.shape[1]
+    found = matrix.tocoo()
+    rows = np.repeat(np.arange(structure.shape[0]), np.diff(structure.indptr))
+    places = np.searchsorted(
+        rows * size + structure.indices, found.coords[0] * size + found.coords[1].astype(np.int64)
+    )
+    return np.bincount(places, found.data, structure.nnz).astype(np.float64)

@@ -156,9 +156,10 @@ class RigidPatch:
             corrector: Newton's method of the body, whose options are used.
             displacement: Displacement of the held degrees of freedom.
         """
-        prescribed = self.problem.prescribed + self.at(displacement)
-        linear = self._held_linear.with_prescribed(prescribed)
-        return replace(corrector, problem=linear.problem, linear_solver=linear)
+        held = self._held_linear
+        body = replace(held.problem, prescribed=self.problem.prescribed + self.at(displacement))
+        linear = replace(held, problem=body, parent=held)  # shares the factor of K(0)
+        return replace(corrector, problem=body, linear_solver=linear)
 
     @cached_property
     def _held_linear(self) -> LinearSolver:

@@ -1,5 +1,9 @@
-"""K(0) of a body as a sum of a few matrices whose factors are functions of the parameters."""
+"""K(0) of a body as a sum of a few matrices whose factors are functions of the parameters.
 
+K(0)^-1 f of any parameters follows by conjugate gradients, preconditioned with the inverse for one.
+"""
+
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -18,6 +22,8 @@ SAMPLES = 64  # points of the parameters at which moduli are compared
 INDEPENDENT = 1e-10  # part of the largest modulus below which a direction counts as rounding [-]
 MAX_CELLS = 32  # different cells by which condition numbers are bounded
 MAX_CORNERS = 6  # parameters of which all corners of the ranges are samples
+MAX_ERROR = 1e-4  # energy norm of the error of an iterated solution over that of the solution [-]
+MAX_BOUND = 200  # largest value of `StiffnessTerms.bound`
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +34,11 @@ class StiffnessTerms:
     linearly. Over all parameters these vectors span a space of few dimensions, of which `vectors`
     is a basis. A homogeneous isotropic law has the factors mu and lambda. Otherwise the basis
     consists of moduli of the law itself, so that the matrices K_k are positive definite.
+
+    The inverse for one point of the ranges, the node, is the preconditioner of all others. The
+    condition number of K(node)^-1 K(0) is bounded for every load (`condition_numbers`), and with it
+    the error of conjugate gradients in the energy norm and their number of steps. Neither depends
+    on the number of terms.
 
     Attributes:
         problem: The body; its law may have ranges.
@@ -65,12 +76,75 @@ class StiffnessTerms:
     @cached_property
     def bodies(self) -> list[Problem]:
         """Linear elastic bodies of the stiffness K_k, without foundation and follower loads."""
-        return [self.body(row) for row in torch.eye(len(self), dtype=torch.float64)]
+        bare = replace(self.problem, springs=None, follower_loads=NO_LOADS)
+        laws = (linear_law(self.problem.reference.material, row) for row in self.vectors)
+        return [replace(bare, material=law) for law in laws]
 
-    def body(self, factors: Tensor) -> Problem:
-        """Return the linear elastic body of factors (T,), without foundation and follower loads."""
-        law = linear_law(self.problem.reference.material, factors @ self.vectors)
-        return replace(self.problem, material=law, springs=None, follower_loads=NO_LOADS)
+    @cached_property
+    def node(self) -> Tensor:
+        """Factors of the body from whose K(0) the others differ least, (1, T)."""
+        middle, samples = self.factors(self.problem.reference.material), self._sampled_factors
+        if not self.varies:
+            return middle
+        candidates = torch.cat([middle, samples])
+        worst = [self.condition_numbers(samples, node).max() for node in candidates.split(1)]
+        return candidates[torch.stack(worst).argmin()][None]
+
+    @cached_property
+    def node_body(self) -> Problem:
+        """The reference body, with its foundation, with the stiffness K(node)."""
+        body = self.problem.reference
+        if not self.varies:
+            return body
+        return replace(body, material=linear_law(body.material, self.node[0] @ self.vectors))
+
+    @cached_property
+    def varies(self) -> bool:
+        """False if K(0) is the same for all parameters."""
+        middle = self.factors(self.problem.reference.material)
+        return not torch.allclose(self._sampled_factors, middle, rtol=1e-12, atol=0.0)
+
+    @cached_property
+    def condition(self) -> float:
+        """Bound of the condition number of K(node)^-1 K(0) for all parameters [-]."""
+        if not self.varies:
+            return 1.0
+        return float(self.condition_numbers(self._sampled_factors, self.node).max())
+
+    @property
+    def bound(self) -> int:
+        """Number of steps after which the error is at most `MAX_ERROR` for every load.
+
+        Source: Saad (2003), Iterative Methods for Sparse Linear Systems, eq. 6.128.
+        """
+        root = math.sqrt(self.condition)
+        if root - 1 < 1e-6:
+            return 1
+        return math.ceil(math.log(2 / MAX_ERROR) / math.log((root + 1) / (root - 1)))
+
+    @property
+    def rtol(self) -> float:
+        """Relative residual, in the norm of K(node)^-1, below which the error is `MAX_ERROR`.
+
+        The squares of this norm and of the energy norm of the error have a ratio between the
+        smallest and the largest eigenvalue of K(node)^-1 K(0).
+        """
+        return MAX_ERROR / math.sqrt(self.condition)
+
+    @property
+    def max_steps(self) -> int:
+        """Number of steps after which the residual is below `rtol`, at conditions up to 1e8."""
+        return 2 * self.bound
+
+    def require_few_steps(self) -> None:
+        """Raise a ValueError if the bound of the number of steps exceeds `MAX_BOUND`."""
+        if self.bound > MAX_BOUND:
+            raise ValueError(
+                f"the parameters {list(self.problem.material.parameter_ranges)} change K(0) by "
+                f"factors whose ratio is up to {self.condition:.3g}, so that the linear solution "
+                f"of this network takes more than {MAX_BOUND} steps; give them smaller ranges, or "
+                "use model.base=null (fcnn, cnn, gnn)"
+            )
 
     def support_forces(self) -> Tensor:
         """Return forces of moved supports and of follower loads at rest, (T + 1, N, D) [-].
@@ -86,12 +160,6 @@ class StiffnessTerms:
             constant = constant + problem.springs.force(p)[0]
         return torch.stack([*forces, constant])
 
-    @cached_property
-    def cell_moduli(self) -> Tensor:
-        """Moduli at rest of each term in each cell as quadratic forms of strains, (T, E, 6, 6)."""
-        rest = torch.zeros(1, len(self.problem.cells), 1, 3, 3, dtype=torch.float64)
-        return torch.stack([_matrices(b.material.tangent(rest)[0, :, 0]) for b in self.bodies])
-
     def condition_numbers(self, factors: Tensor, node: Tensor) -> Tensor:
         """Return bounds of the condition numbers of K(node)^-1 K(0), (S,), for every load.
 
@@ -103,11 +171,11 @@ class StiffnessTerms:
 
         Args:
             factors: Factors of K(0), (S, T).
-            node: Factors of the other matrix, (T,).
+            node: Factors of the other matrix, (1, T).
         """
         moduli = self._some_cells
-        of_node = torch.einsum("t,teij->eij", node, moduli)
-        ratios = _ratios(of_node, torch.einsum("st,teij->seij", factors, moduli)).flatten(1)
+        of_node, others = (torch.einsum("st,teij->seij", a, moduli) for a in (node, factors))
+        ratios = _ratios(of_node, others).flatten(1)
         low, high = ratios.amin(dim=1), ratios.amax(dim=1)
         if self.problem.springs is not None:
             low, high = low.clamp(max=1.0), high.clamp(min=1.0)
@@ -115,8 +183,13 @@ class StiffnessTerms:
 
     @cached_property
     def _some_cells(self) -> Tensor:
-        """Moduli of the terms in at most `MAX_CELLS` different cells, (T, C, 6, 6)."""
-        moduli = self.cell_moduli.transpose(0, 1).flatten(1)  # (E, T 36)
+        """Moduli of the terms in at most `MAX_CELLS` different cells, (T, C, 6, 6).
+
+        They are quadratic forms of strains.
+        """
+        rest = torch.zeros(1, len(self.problem.cells), 1, 3, 3, dtype=torch.float64)
+        every = torch.stack([_matrices(b.material.tangent(rest)[0, :, 0]) for b in self.bodies])
+        moduli = every.transpose(0, 1).flatten(1)  # (E, T 36)
         digits = (moduli / moduli.abs().amax() * 1e9).round()
         _, numbers = digits.unique(dim=0, return_inverse=True)
         first = torch.full((int(numbers.max()) + 1,), len(numbers))
@@ -124,10 +197,10 @@ class StiffnessTerms:
         if len(first) > MAX_CELLS:
             order = torch.randperm(len(first), generator=torch.Generator().manual_seed(0))
             first = first[order[:MAX_CELLS]]
-        return self.cell_moduli[:, first]
+        return every[:, first]
 
-    @property
-    def sampled_factors(self) -> Tensor:
+    @cached_property
+    def _sampled_factors(self) -> Tensor:
         """Factors at corners and random points of the parameters, (S, T)."""
         law = self.problem.material
         return self.factors(law.with_parameters(_samples(law)))

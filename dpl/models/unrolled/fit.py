@@ -360,7 +360,7 @@ def fit_in_best_modes(
     count = every.shape[1]
     while count:
         modes = every[:, :count]
-        stiffness = ReducedStiffness(reduced_terms(linear.terms, modes), linear.iteration)
+        stiffness = ReducedStiffness(reduced_terms(linear.terms, modes), linear.terms)
         # coordinates of images of the samples are those of the samples in images of the modes
         fitted = _joined(
             in_coordinates(linear.terms, images[:, :count], stiffness, both[0], rests[0])

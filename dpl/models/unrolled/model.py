@@ -143,7 +143,7 @@ class Unrolled(StoredBuffers):
         self.linear = LinearResponse(scene, self.group)
         for name, (shape, dtype) in self._layout().items():
             self.register_buffer(name, torch.zeros(shape, dtype=dtype))
-        self._stiffness = ReducedStiffness(self.stiffness, self.linear.iteration)
+        self._stiffness = ReducedStiffness(self.stiffness, self.linear.terms)
         self._compiled: tuple[Tensor, ModelArrays, Tensor] | None = None
         self._law_of_samples = scene.problem.material  # perhaps with ranges
         self._last: tuple[Tensor, Tensor, tuple[LawArguments, Array, _Solve]] | None = None
@@ -241,7 +241,7 @@ class Unrolled(StoredBuffers):
     def _prepare(self) -> None:
         """Prepare what a traced graph takes as constants, after the buffers have changed."""
         parts = self.stiffness.detach().cpu().clone()
-        self._stiffness = ReducedStiffness(parts, self.linear.iteration)
+        self._stiffness = ReducedStiffness(parts, self.linear.terms)
         self._law_of_samples = self.scene.problem.material.of_cells(self.cells.cpu()).centred()
         self.__dict__.pop("_doubt", None)
 
@@ -409,8 +409,6 @@ class Unrolled(StoredBuffers):
             if (getattr(self, name) < 0).any():
                 raise ValueError(f"{name} must be 0 or more")
         factors = self.linear.terms.factors(problem.reference.material)
-        matrix = ReducedStiffness(self.stiffness.cpu(), self.linear.iteration).at(factors)[
-            0, :, :-1
-        ]
+        matrix = ReducedStiffness(self.stiffness.cpu(), self.linear.terms).at(factors)[0, :, :-1]
         if torch.linalg.cholesky_ex(matrix).info:
             raise ValueError("stiffness must be positive definite")

@@ -6,12 +6,10 @@ import torch
 
 from dpl import fem
 from dpl.fem import NeoHookeanLn
-from dpl.fem.linear import conjugate_gradients
 from dpl.fem.linear.interface import full_matrix
-from dpl.fem.rom import stiffness_iteration
-from dpl.fem.rom.stiffness_iteration import MAX_ERROR, StiffnessIteration, TermMatrices, node_body
-from dpl.fem.solvers.parity_factor import OrbitForm
-from dpl.fem.solvers.stiffness_terms import StiffnessTerms
+from dpl.fem.linear.krylov import conjugate_gradients, conjugate_gradients_of_tensors
+from dpl.fem.solvers.parity_factor import OrbitForm, TermMatrices
+from dpl.fem.solvers.stiffness_terms import MAX_ERROR, StiffnessTerms
 
 REGION = {"core": fem.Sphere([0.0, 0.0, 0.0], 0.7)}
 SPRINGS = [fem.RobinBC(fem.Plane(2, 0.0), 0.3)]
@@ -83,22 +81,20 @@ def random_parameters(problem, count):
 
 
 def test_condition_numbers_are_at_most_their_bounds(terms):
-    iteration = StiffnessIteration.of_terms(terms)
-    root = np.linalg.cholesky(dense(node_body(terms, iteration)))
-    node = torch.tensor(iteration.node, dtype=torch.float64)
+    root = np.linalg.cholesky(dense(terms.node_body))
     for own in random_parameters(terms.problem, 4):
         body = terms.problem.with_parameters(own[None])
         half = np.linalg.solve(root, dense(body))
         values = np.linalg.eigvalsh(np.linalg.solve(root, half.T))
-        bound = float(terms.condition_numbers(terms.factors(body.material), node))
+        bound = float(terms.condition_numbers(terms.factors(body.material), terms.node))
         assert 1 < values[-1] / values[0] <= bound * (1 + 1e-9)
-        assert bound <= iteration.condition * (1 + 1e-9)
+        assert bound <= terms.condition * (1 + 1e-9)
 
 
 def test_matrices_of_the_terms_sum_up_to_the_stiffness_of_each_parity(terms):
     body, random = terms.problem.reference, np.random.default_rng(0)
-    form, iteration = OrbitForm.of(body, fem.symmetries(body)), StiffnessIteration.of_terms(terms)
-    matrices = TermMatrices.of(terms, form, iteration)
+    form = OrbitForm.of(body, fem.symmetries(body))
+    matrices = TermMatrices.of(terms, form)
     factors = np.append(terms.factors(body.material)[0].numpy(), 1.0)
     parts = form.parts(torch.from_numpy(random.standard_normal(int(body.free.sum())))).numpy()
     pairs = zip(form.matrices(body), parts, strict=True)
@@ -112,15 +108,15 @@ def test_matrices_of_the_terms_sum_up_to_the_stiffness_of_each_parity(terms):
 
 def test_the_error_of_every_force_and_parameter_is_small_after_at_most_the_steps(terms):
     """The steps stop by the norm of the preconditioner, the error is in the energy norm."""
-    iteration, random = StiffnessIteration.of_terms(terms), np.random.default_rng(3)
-    near = np.linalg.inv(dense(node_body(terms, iteration)))
+    random = np.random.default_rng(3)
+    near = np.linalg.inv(dense(terms.node_body))
     for own in random_parameters(terms.problem, 4):
         matrix = dense(terms.problem.with_parameters(own[None]))
         point = np.zeros(len(matrix))
         point[random.integers(len(point))] = 1.0
         for force in (point, random.standard_normal(len(matrix))):
             exact = np.linalg.solve(matrix, force)
-            ends = iteration.rtol, iteration.max_steps
+            ends = terms.rtol, terms.max_steps
             found = conjugate_gradients(matrix.dot, near.dot, force, *ends, natural=True)
             error = found - exact
             assert error @ matrix @ error < MAX_ERROR**2 * (exact @ matrix @ exact)
@@ -138,7 +134,7 @@ def system(size=40, seed=0):
 def by_tensors(matrix, inverse, right, rtol, steps=60):
     matrix, inverse, right = map(torch.from_numpy, (matrix, inverse, right))
     maps = (lambda x: x @ matrix), (lambda x: x @ inverse)
-    return stiffness_iteration.conjugate_gradients(*maps, right, rtol, steps).numpy()
+    return conjugate_gradients_of_tensors(*maps, right, rtol, steps).numpy()
 
 
 @pytest.mark.parametrize(("rtol", "scale"), [(1e-2, 1e200), (1e-5, 1.0), (1e-10, 1e-200)])
@@ -163,7 +159,7 @@ def test_fewer_steps_than_the_tolerance_needs_are_all_that_are_taken():
 
 
 def test_a_law_without_ranges_needs_no_iteration(grid):
-    found = StiffnessIteration.of_terms(terms_of(grid, "no range"))
+    found = terms_of(grid, "no range")
     assert not found.varies
     assert (found.condition, found.bound) == (1.0, 1)
 
