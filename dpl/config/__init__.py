@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from dpl.config.run_folder import (
         load_data,
         load_run,
-        load_runs,
-        training_loads,
     )
     from dpl.config.validation import ConfigError, Keys
     from dpl.version import CONF
