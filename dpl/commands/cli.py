@@ -17,10 +17,8 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from dpl import config
@@ -136,7 +134,7 @@ def readable_errors() -> Iterator[None]:
         if HydraConfig.initialized():
             _drop_empty(Path(HydraConfig.get().runtime.output_dir))
         sys.exit(2)
-    except (YAMLError, HydraException, OmegaConfBaseException) as error:
+    except YAMLError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:  # the reader of the output has ended, as `head` does

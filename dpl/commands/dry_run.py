@@ -14,8 +14,10 @@ from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import configure_log
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from dpl import config
 from dpl.commands import overrides
@@ -91,6 +93,8 @@ def check(
     first, jobs = _jobs(args)
     if args.cfg or args.info is not None:
         return None
+    with config.error_in("run", OmegaConfBaseException):
+        first.hydra.run.dir  # noqa: B018  # raises if `run` is no text
     every = [overrides.job(cfg) for cfg in jobs or [first]]
     for cfg in every:
         config.check(cfg, keys=keys)
@@ -149,5 +153,6 @@ def _jobs(args: Namespace) -> tuple[DictConfig, list[DictConfig] | None]:
     given = {one.key_or_group for one in every}
     params = first.hydra.sweeper.get("params") or {}
     swept += [overrides.parsed(f"{k}={v}") for k, v in params.items() if k not in given]
-    (jobs,) = BasicSweeper.split_arguments(swept, None)
+    with config.error_in("hydra/sweeper", HydraException):
+        (jobs,) = BasicSweeper.split_arguments(swept, None)
     return first, [overrides.composed(args.config_name, [*fixed, *job]) for job in jobs]
