@@ -148,9 +148,10 @@ def _family(name: str) -> str:
 
 
 METHODS = (dict | None, "galerkin corrected")  # keys of `trained_methods`
+KEYS = (METHODS,)
 
 
-@command("pareto", conf=CONF, keys=(METHODS,))
+@command("pareto", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Measure all solvers and the networks of a folder of runs; write rows and a figure."""
     solvers, batch = _solvers(cfg)
