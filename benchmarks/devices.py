@@ -1,10 +1,10 @@
-"""Speed and memory of networks on one device: training steps and predictions.
+"""Measure networks on the GPU or the processor: python scripts/devices.py device=auto.
 
-The same functions measure a GPU and the processor. Clocks are read after the device has finished.
-The inputs of a training step are in the memory of the device. Loads are those of the scene; targets
-are artificial, because the speed does not depend on them.
-
-A training step of a network with a linear base has the linear solutions of its samples already.
+Writes training steps and predictions per second, latencies, parameters and peak memory of each
+network to devices_DEVICE.csv, and the machine to devices_DEVICE.json. Clocks are read after the
+device has finished. The inputs of a training step are in the memory of the device. Loads are those
+of the scene; targets are artificial, because the speed does not depend on them. A training step of
+a network with a linear base has the linear solutions of its samples already.
 """
 
 import gc
@@ -19,13 +19,19 @@ from typing import Any, cast
 
 import torch
 from lightning.fabric.utilities import move_data_to_device
+from omegaconf import DictConfig
 from torch import nn
 
+from benchmarks import CONF
+from benchmarks.study import record
+from dpl import config
+from dpl.commands.cli import command
 from dpl.evaluation.timing import percentiles
 from dpl.fem import Load
 from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
 from dpl.models.inputs import Base
 from dpl.scene import Sample, Scene
+from dpl.system.threads import limited_threads
 from dpl.training import MSE, Surrogate
 
 FIT = "unrolled"  # has no training step
@@ -248,3 +254,32 @@ def facts(device: torch.device) -> dict[str, str | int | None]:
             "tf32_products": str(torch.backends.cuda.matmul.allow_tf32),
         }
     return found
+
+
+KEYS = (
+    (str, "device"),
+    (Sequence[int], "batches predictions", 1, 10**6),
+    (int, "threads", 1, 10**4),
+    (float, "seconds", 1e-3, 1e6),
+)
+
+
+@command("devices", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Measure the chosen networks; rows are written after each network."""
+    names = list(NETWORKS) if cfg.networks is None else list(cfg.networks)
+    if unknown := [name for name in names if name not in NETWORKS]:
+        raise config.ConfigError(f"networks = {unknown[0]!r} must be one of {', '.join(NETWORKS)}")
+    with config.error_in("device", ValueError):
+        device = select_device(cfg.device)
+    scene = config.build_scene(cfg)
+    print(*scene.describe()[0], flush=True)
+    with limited_threads(cfg.threads):
+        clock = Clock(device, cfg.repeats, cfg.seconds)
+        samples, calls = samples_of(scene, cfg.samples), (cfg.batches, cfg.predictions)
+        times = (row for name in names for row in measure(name, scene, samples, clock, *calls))
+        stem = Path(cfg.folder) / f"devices_{device.type}"
+        title, known = "training steps and predictions", facts(device)
+        rows = record(times, stem, title, threads=cfg.threads, facts=known)
+    if not rows:
+        raise config.ConfigError("networks: none fits into the memory")

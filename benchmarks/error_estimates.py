@@ -1,6 +1,13 @@
-"""Estimated over true errors of predictions: calibration of the `error` of the simulator."""
+"""Calibrate the estimated errors of the simulator: python scripts/error_estimates.py.
+
+Compares the estimated with the true errors of answers of the simulator: in range, at twice the
+range, and under loads that compress, twist and pinch the body. Trains models on several bodies, or
+takes those of a folder of runs (run=runs/beam_nh_loss), which get no loads of the latter kind.
+Writes the errors of all answers, quantiles of their ratios and a figure.
+"""
 
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,12 +18,15 @@ from typing import Any, cast
 import lightning as L
 import numpy as np
 import torch
+from omegaconf import DictConfig
 from torch import Tensor
 
-from benchmarks import peers
-from benchmarks.samples import solved
-from benchmarks.study import OTHER_COLOURS, picture
-from dpl import Sample, Scene, fem
+from benchmarks import CONF, peers
+from benchmarks.methods import load_runs
+from benchmarks.samples import first, solved
+from benchmarks.study import OTHER_COLOURS, picture, record
+from dpl import Sample, Scene, config, fem
+from dpl.commands.cli import command
 from dpl.data import DataModule
 from dpl.inference import Simulator
 from dpl.models import FCNN, PODNet, Unrolled
@@ -286,18 +296,18 @@ def conclude(found: Sequence[Estimate]) -> None:
     )
 
 
-def draw(found: Sequence[Estimate], path: Path) -> None:
+def draw(rows: Sequence[Estimate], path: Path) -> None:
     """Draw estimated over true error against the true error, a panel for each body."""
-    bodies = list(dict.fromkeys(one.body for one in found))
-    kinds = list(dict.fromkeys(one.loads for one in found))
-    rows = math.ceil(len(bodies) / 2)
-    with picture(path, 2.4 * rows + 0.6) as figure:
-        axes = figure.subplots(rows, min(len(bodies), 2), sharex=True, sharey=True, squeeze=False)
+    bodies = list(dict.fromkeys(one.body for one in rows))
+    kinds = list(dict.fromkeys(one.loads for one in rows))
+    lines = math.ceil(len(bodies) / 2)
+    with picture(path, 2.4 * lines + 0.6) as figure:
+        axes = figure.subplots(lines, min(len(bodies), 2), sharex=True, sharey=True, squeeze=False)
         for ax, body in zip(axes.flat, bodies, strict=False):
             ax.axhspan(LEAST, 1 / LEAST, color="0.93", lw=0)
             ax.axhline(1.0, color="0.5", lw=0.7)
             for colour, loads in zip(LOAD_COLOURS, kinds, strict=False):
-                own = [one for one in found if (one.body, one.loads) == (body, loads)]
+                own = [one for one in rows if (one.body, one.loads) == (body, loads)]
                 own = [one for one in own if one.error > EXACT]
                 errors = np.array([one.error for one in own])
                 ratios = np.array([one.estimated for one in own]) / errors
@@ -312,3 +322,44 @@ def draw(found: Sequence[Estimate], path: Path) -> None:
             ax.remove()
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=5, markerscale=2.5)
+
+
+COUNTS = tuple((int, name, 1, 10**6) for name in ("train", "val", "test", "epochs", "softened"))
+KEYS = ((Sequence[str], "bodies"), (str, "name"), *COUNTS)
+
+
+@command("error_estimates", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Compare the estimates on all bodies, print one table and write rows and a figure."""
+    if not cfg.bodies or set(cfg.bodies) - set(BODIES):
+        names = ", ".join(BODIES)
+        raise config.ConfigError(f"bodies = {list(cfg.bodies)} must be some of {names}")
+    folder = Path(cfg.folder)
+    found = list(_of_runs(cfg) if cfg.run else _of_bodies(cfg, folder))
+    record(found, folder / f"{cfg.name}_loads", None, draw)
+    title = "estimated over true error of all answers, 1 thread"
+    record(summarised(found), folder / cfg.name, title)
+    conclude(found)
+
+
+def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator[Estimate]:
+    """Yield the estimates of models that are trained on each body."""
+    for body in cfg.bodies:
+        start = time.perf_counter()
+        scene = BODIES[body]()
+        print(*scene.describe()[0], flush=True)
+        data = solved_data(scene, folder / "data" / body, cfg.train, cfg.val, cfg.test)
+        simulators = trained(scene, data, cfg.epochs)
+        test = first(data.samples("test"), cfg.test)
+        yield from estimates(body, scene, test, simulators, softened(scene, cfg.softened))
+        print(f"{body}: {time.perf_counter() - start:.0f} s", flush=True)
+
+
+def _of_runs(cfg: DictConfig) -> Iterator[Estimate]:
+    """Yield the estimates of all runs in a folder."""
+    runs = load_runs(cfg.run)
+    run, surrogate = next(iter(runs.values()))
+    scene = surrogate.scene
+    test = first(config.load_data(run, scene).samples("test"), cfg.test)
+    simulators = {name: Simulator(surrogate) for name, (_, surrogate) in runs.items()}
+    yield from estimates(Path(cfg.run).name, scene, test, simulators)

@@ -1,4 +1,7 @@
-"""Random grasps of a body: errors, reactions and times of a network and of Newton's method."""
+"""Measure random grasps of a trained run: python scripts/grasps.py run=runs/beam.
+
+Errors, reactions and times of the network and of Newton's method.
+"""
 
 import math
 import time
@@ -10,12 +13,17 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from omegaconf import DictConfig
 from torch import Tensor
 
-from benchmarks.study import METHOD_COLOURS, picture
-from dpl import Scene
+from benchmarks import CONF
+from benchmarks.study import METHOD_COLOURS, picture, record
+from dpl import Scene, config
+from dpl.commands.cli import command
 from dpl.fem import Load, RigidPatch, Sphere
 from dpl.inference import Gripper
+from dpl.models.unrolled.correction import MAX_STEPS
+from dpl.system.threads import one_thread
 
 RADII = 0.05, 0.15  # smallest and largest radius of a patch over L [-]
 LOADS = 32  # training loads whose largest energy is that of the largest grasp
@@ -285,3 +293,33 @@ def draw(rows: Sequence[Amplitude], path: Path) -> None:
         ax.set(xlabel="amplitude of the motion [-]", ylabel="error of the displacement [-]")
         ax.grid(visible=True)
         ax.legend()
+
+
+KEYS = (
+    (str, "name"),
+    (int, "count", 1, 10**6),
+    (int, "seed", 0, 10**9),
+    (int, "amplitudes", 1, 10**4),
+)
+
+
+@command("grasps", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Measure random grasps: motion, displacement, reactions, estimated error and times."""
+    _, surrogate = config.load_run(cfg.run)
+    if surrogate.scene.problem.shape[1] != 3:
+        raise config.ConfigError(f"run = {cfg.run} must have a body in 3D")
+    gripper, stem = Gripper(surrogate, steps=MAX_STEPS), Path(cfg.folder) / cfg.name
+    every = list(random_grasps(surrogate.scene, cfg.count, cfg.seed))
+
+    def say(number: int) -> None:
+        if number % 50 == 0:
+            print(f"{number} of {cfg.count} grasps", flush=True)
+
+    with one_thread():
+        rows, unknown = measure(gripper, every, say)
+        amplitudes = against_amplitude(gripper, every[: cfg.amplitudes])
+    record(rows, stem, f"{cfg.count - unknown} random grasps, 1 thread")
+    record(amplitudes, stem.with_name(f"{cfg.name}_amplitude"), None, draw)
+    print(f"without a solution by Newton's method from rest, left out: {unknown}")
+    print(f"slope of the error of the network in the amplitude: {slope(amplitudes):.2f}")

@@ -1,15 +1,20 @@
-"""Methods of a comparison: linear, POD-Galerkin, network, corrected network."""
+"""Methods of a comparison: linear, POD-Galerkin, networks of a folder of runs, corrected ones."""
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import torch
+from omegaconf import DictConfig
 from torch import Tensor
 
 from benchmarks.pod_galerkin import PODGalerkin
+from dpl import config
+from dpl.config.plain import read_config
+from dpl.config.run_folder import OF_SCENE
 from dpl.fem import Load, SubspaceNewton
 from dpl.inference.hybrid import Predict
 from dpl.scene import Sample, Scene
@@ -109,3 +114,36 @@ def training_minutes(folder: Path) -> float | None:
         return None
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     return sum(float(line["seconds"]) for line in lines) / 60
+
+
+def load_runs(
+    folder: str | Path, names: Sequence[str] | None = None, *, trust: bool = False
+) -> dict[str, tuple[DictConfig, TrainedSurrogate]]:
+    """Return the configurations and surrogates of named runs in a folder, or of all.
+
+    Runs whose configurations have the same keys of the scene share one scene.
+
+    Raises:
+        ConfigError: There are none, or one cannot be used or belongs to another scene.
+    """
+    if names is None:
+        names = sorted(path.parent.name for path in Path(folder).glob("*/config.yaml"))
+    if not names:
+        raise config.ConfigError(
+            f"run = {folder} contains no runs; train some with run={folder}/NAME"
+        )
+    runs: dict[str, tuple[DictConfig, TrainedSurrogate]] = {}
+    scenes: dict[str, Scene] = {}  # by their part of the configuration
+    for name in names:
+        path, _ = config.files_of_run(Path(folder) / name)
+        part = {key: node for key, node in read_config(path).items() if key in OF_SCENE}
+        known = scenes.get(key := json.dumps(part))
+        runs[name] = config.load_run(Path(folder) / name, trust=trust, scene=known)
+        own = scenes.setdefault(key, runs[name][1].scene)
+        first = next(iter(scenes.values()))
+        if own.fingerprint != first.fingerprint:
+            differences = "; ".join(first.differences(own.identity()))
+            raise config.ConfigError(
+                f"run = {folder}: {name} is of another scene than {names[0]}: {differences}"
+            )
+    return runs

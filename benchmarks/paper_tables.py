@@ -32,6 +32,30 @@ PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int | None]]
     },
     "beam_young_wide": {"paper": (1e-4, None, None, None)},  # "at best"
 }
+# Odot, Haferssas, Cotin (2022), tables 2, 4 and 6: e_mean, e_max, SNR [dB] of one load
+PAPER_SINGLE: dict[str, dict[str, tuple[float, float, float]]] = {
+    "beam_svk": {
+        "paper, beam (a)": (5.4e-5, 0.037, 22.2),
+        "paper, beam (b)": (6.6e-6, 0.0050, 40.2),
+    },
+    "propeller_nh": {
+        "paper, propeller (c)": (2.82e-6, 0.0036, 33.9),
+        "paper, propeller (d)": (8.2e-7, 0.0008, 42.3),
+    },
+    "beam_nh_loss": {
+        "paper, L_r^* (a)": (6.1e-6, 0.027, 38.21),
+        "paper, L_r^* (b)": (1.5e-5, 0.034, 34.7),
+        "paper, MSE (c)": (5.3e-5, 0.034, 25.42),
+        "paper, MSE (d)": (5.5e-5, 0.037, 24.9),
+    },
+    "beam_young": {
+        "paper, beam (a)": (3.9e-5, 0.028, 25.66),
+        "paper, beam (b)": (4.8e-5, 0.038, 25.42),
+        "paper, beam (c)": (4.1e-5, 0.034, 24.25),
+        "paper, beam (d)": (6.8e-5, 0.060, 23.73),
+    },
+}
+ONE = "one load"  # name of the set of a single test load
 STREAMS = {"twice": 4, "small": 5}  # of loads; those of samples and scales are below
 CORRECTED = " corrected"  # ends the name of a network that is corrected
 PLAIN = "_plain"  # ends the name of a network without the linear solution
@@ -70,6 +94,14 @@ class Result:
     ms_p99: float | None = None  # 99th percentile of the same [ms]
     # mean iterations of Newton from it to the scene's tolerance, in range
     newton_iterations: float | None = None
+
+
+def one_load(test: Sample, deflection: float) -> dict[str, Sample]:
+    """Return the test load whose largest nodal displacement over L is nearest to a number [-]."""
+    largest = test.displacement.norm(dim=2).amax(dim=1)
+    k = int((largest - deflection).abs().argmin())
+    print(f"test load {k}: largest nodal displacement {float(largest[k]):.4g} L")
+    return {ONE: Sample(*(column[k : k + 1] for column in test))}
 
 
 def load_sets(scene: Scene, test: Sample, count: int = 50) -> dict[str, Sample]:
@@ -146,6 +178,16 @@ def paper(experiment: str) -> list[Result]:
                 rel_L2_worst=worst,
             )
         )  # fmt: skip
+    return rows
+
+
+def paper_single(experiment: str) -> list[Result]:
+    """Return the rows of the single loads of the paper for an experiment, or none."""
+    rows = []
+    for name, (e_mean, e_max, snr) in PAPER_SINGLE.get(experiment, {}).items():
+        error = 10 ** (-snr / 20)
+        rows.append(Result(name, ONE, 1, e_mean=e_mean, e_max=e_max, SNR_min=snr,
+                           rel_L2_median=error, rel_L2_worst=error))  # fmt: skip
     return rows
 
 

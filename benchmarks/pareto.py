@@ -1,20 +1,29 @@
-"""Run time against error of all iterates of solvers on the same loads."""
+"""Measure run time and error of all solvers: python scripts/pareto.py run=runs/beam_svk.
+
+All iterates of the solvers and of the networks of a folder of runs, on the same loads.
+"""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
+from omegaconf import DictConfig
+from rich.progress import Progress
 
-from benchmarks.study import method_colours, picture, place_labels
+from benchmarks import CONF, methods
+from benchmarks.study import method_colours, picture, record
+from dpl import config, inference
+from dpl.commands.cli import command
+from dpl.data import DataModule
 from dpl.evaluation.timing import WARM_UP, percentiles
 from dpl.fem import Load, Solution, Solver, solve
 from dpl.scene import Sample
-from dpl.system.threads import one_thread
-from dpl.training import relative_errors
+from dpl.system.threads import available_cores, limited_threads
+from dpl.training import TrainedSurrogate, relative_errors
 from dpl.training.metrics import median
 
 if TYPE_CHECKING:
@@ -56,12 +65,11 @@ def points(
 ) -> list[Point]:
     """Return run times and errors of all iterates of solvers, one load at a time.
 
-    Each solver is warmed up, then solves all loads in a row; `tick` is called after each. With one
-    thread of torch BLAS has one too, otherwise its default.
+    Each solver is warmed up, then solves all loads in a row; `tick` is called after each.
     """
     singles = batch.load.unbatch()
     found = []
-    with _threads(threads), torch.inference_mode():
+    with limited_threads(threads), torch.inference_mode():
         for name, solver in solvers.items():
             for load in singles[:WARM_UP]:
                 solve(solver, load)
@@ -86,17 +94,6 @@ def time_iterates(solver: Solver, load: Load) -> list[tuple[float, Solution]]:
     return [(1e3 * (time.perf_counter() - start), state) for state in solver.iterate(load)]
 
 
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        with one_thread() if count == 1 else nullcontext():
-            yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def draw(rows: Sequence[Point], path: Path) -> None:
     """Draw run time against error of the iterates of solvers, with the first number of threads.
 
@@ -109,7 +106,6 @@ def draw(rows: Sequence[Point], path: Path) -> None:
     families = {name: _family(name) for name in solvers}
     with picture(path, 4.4) as figure:
         ax = figure.subplots()
-        labels = []
         for family, colour in method_colours(dict.fromkeys(families.values())).items():
             lines = [
                 [row for row in rows if row.solver == name]
@@ -118,11 +114,9 @@ def draw(rows: Sequence[Point], path: Path) -> None:
             ]
             if family == "Newton":  # one line through the solutions to all tolerances
                 lines = [sorted((line[-1] for line in lines), key=lambda row: row.ms)]
-            starts = [at for line in lines if (at := _draw_line(ax, line, colour))]
-            if starts:
-                label = ax.annotate(family, min(starts), (0, 0), textcoords="offset points")
-                label.set(color=colour, weight="bold", ha="center", va="center")
-                labels.append(label)
+            for line in lines:
+                _draw_line(ax, line, colour)
+            ax.plot([], [], color=colour, lw=2.5, label=family)
         used = {name.partition(", ")[2] for name in solvers}
         for method, words in WORDS.items():
             if method in used:
@@ -134,22 +128,86 @@ def draw(rows: Sequence[Point], path: Path) -> None:
         ax.xaxis.set_major_formatter("{x:g}")
         ax.xaxis.set_minor_formatter("")
         ax.grid(visible=True)
-        ax.legend(loc="lower left")
-        place_labels(ax, labels)
+        figure.legend(loc="outside right upper")
 
 
-def _draw_line(ax: "Axes", line: Sequence[Point], colour: str) -> tuple[float, float] | None:
-    """Draw the iterates of a solver, the last one larger; return the place of the first."""
+def _draw_line(ax: "Axes", line: Sequence[Point], colour: str) -> None:
+    """Draw the iterates of a solver, the last one larger."""
     shown = [row for row in line if row.error < 1]
     if not shown:
-        return None
+        return
     style = {"color": colour, "marker": MARKERS.get(shown[-1].solver.partition(", ")[2], "o")}
     x, y = [row.ms for row in shown], [max(row.error, LEAST) for row in shown]
     ax.loglog(x, y, lw=1.2, ms=3, **style)
     ax.loglog(x[-1:], y[-1:], ms=7, **style)
-    return x[0], y[0]
 
 
 def _family(name: str) -> str:
     """Return the method of a solver without its variant and tolerance."""
     return name.partition(", ")[0].partition(" to ")[0]
+
+
+METHODS = (dict | None, "galerkin corrected")  # keys of `trained_methods`
+KEYS = (METHODS,)
+
+
+@command("pareto", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Measure all solvers and the networks of a folder of runs; write rows and a figure."""
+    solvers, batch = _solvers(cfg)
+    rows: list[Point] = []
+    for threads in cfg.threads:
+        count = threads or available_cores()
+        with Progress() as progress:
+            bar = progress.add_task(f"solvers, {count} threads", total=len(solvers))
+            rows += points(solvers, batch, threads=count, tick=partial(progress.advance, bar))
+    title = Path(cfg.run).name
+    record(rows, Path(cfg.folder) / f"pareto_{title}", title, draw, threads=rows[0].threads)
+
+
+def _solvers(cfg: DictConfig) -> tuple[dict[str, Solver], Sample]:
+    """Return all solvers including the networks of the runs, and the test loads."""
+    runs = methods.load_runs(cfg.run, trust=cfg.trust)
+    first, surrogate = next(iter(runs.values()))
+    scene = surrogate.scene
+    data = config.load_data(first, scene)
+    solvers: dict[str, Solver] = {"linear": scene.linear}
+    solvers |= {f"Newton to {tol:g}": replace(scene.newton, tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
+    for (name, variant), method in trained_methods(cfg, runs, data).items():
+        title = f"{name}, {variant}" if variant else name
+        solvers[title] = inference.Direct(method.predict, scene.problem)
+    for name, (_, surrogate) in runs.items():
+        solvers[f"{name}, hybrid"] = inference.default_hybrid(surrogate.predict, scene)
+    return solvers, data.samples("test")
+
+
+def trained_methods(
+    cfg: DictConfig, runs: Mapping[str, tuple[DictConfig, TrainedSurrogate]], data: DataModule
+) -> dict[tuple[str, str], methods.Method]:
+    """Return POD-Galerkin, the networks and the corrected networks, by name and variant.
+
+    The variant is "corrected" or empty. Reduced models are made from the training samples, or from
+    the validation samples of a run that has none on disk.
+    """
+    found: dict[tuple[str, str], methods.Method] = {}
+    if cfg.galerkin:
+        found["POD-Galerkin", ""] = _made(cfg, "galerkin", data.scene, data.snapshots())
+    for name, (trained, surrogate) in runs.items():
+        train = trained.data.train  # no number for a stream
+        loads = train if isinstance(train, int) else None
+        plain = methods.network(surrogate, Path(cfg.run) / name, loads)
+        found[name, ""] = plain
+        if cfg.corrected and {"correction", "vectors"} & set(dir(surrogate.net)):
+            samples = data.snapshots()
+            found[name, "corrected"] = _made(cfg, "corrected", surrogate, plain, samples)
+    return found
+
+
+def _made(cfg: DictConfig, key: str, *parts: object) -> methods.Method:
+    """Return the method of a key; raise a `ConfigError` with the remedy if it cannot be made."""
+    make = config.instantiate(cfg, key)
+    try:
+        made: methods.Method = make(*parts)
+    except ValueError as error:
+        raise config.ConfigError(f"{key}: {error}; {key}=null leaves it out") from error
+    return made

@@ -1,18 +1,29 @@
-"""Soak test: memory, rate, files and processes over hours of work at full speed."""
+"""Run the soak test: python scripts/soak.py minutes=30.
 
+Trains on a stream that worker processes solve, then evaluates the simulator of the trained run,
+each for `minutes`. Writes the resources of both, every few seconds, and a figure. The exit status
+is 1 if resources grow, the rate falls or processes are left over.
+"""
+
+import gc
 import os
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import lightning as L
 import torch
+from omegaconf import DictConfig
 
-from benchmarks.study import OTHER_COLOURS, picture
-from dpl import Scene
+from benchmarks import CONF
+from benchmarks.study import OTHER_COLOURS, picture, record
+from dpl import Scene, config
+from dpl.commands import cli
 from dpl.inference import Simulator
 
 SHARED = Path("/dev/shm")
@@ -225,3 +236,60 @@ def draw(rows: Sequence[Usage], path: Path) -> None:
             ax.set_ylim(bottom=0)
             ax.grid(visible=True)
         figure.legend(loc="outside lower center", ncols=2)
+
+
+KEYS = ((float, "minutes", 1e-2, 1e6), (Sequence[Literal["training", "simulator"]], "workloads"))
+RECORDS = 360  # of each workload
+
+
+@cli.command("soak", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Train, simulate and record the resources of both."""
+    if not cfg.workloads:
+        raise config.ConfigError("workloads = [] must contain training, simulator or both")
+    folder, seconds = Path(cfg.folder), 60.0 * cfg.minutes
+    rows: list[Usage] = []
+    wrong: list[str] = []
+
+    def report(work: list[Usage]) -> None:
+        rows.extend(work)
+        wrong.extend(f"{work[-1].workload}: {line}" for line in regressions(work))
+        record(rows, folder / "soak", None, draw)
+        print(summary(work))
+
+    if "training" in cfg.workloads:
+        before = usage("before", 0.0, 0)
+        report(_train(cfg, seconds))
+        gc.collect()  # frees the last batches in shared memory
+        time.sleep(2.0)  # workers end
+        wrong += [
+            f"after the training: {line}" for line in leftovers(before, usage("after", 0.0, 0))
+        ]
+    if "simulator" in cfg.workloads:
+        _, surrogate = config.load_run(folder, trust=True)
+        records = []
+        for row in simulator(Simulator(surrogate), seconds, every=seconds / RECORDS):
+            records.append(row)
+            said = f"{row.seconds / 60:.1f} min: {row.steps:,} answers ..."
+            print(said, end="\r", file=sys.stderr)
+        report(records)
+    print("\n".join(wrong) or "no growth, no loss of speed, nothing left over")
+    if wrong:
+        sys.exit(1)
+
+
+def _train(cfg: DictConfig, seconds: float) -> list[Usage]:
+    """Train for a time [s] and return the records."""
+    scene = config.build_scene(cfg)
+    data = config.instantiate(cfg, "data", scene=scene)
+    surrogate = config.build_surrogate(cfg, scene)
+    trainer = config.build_trainer(cfg)
+    cli.check_trainer(trainer, cfg)
+    monitor = UsageMonitor(seconds, every=seconds / RECORDS)
+    trainer.callbacks.append(monitor)
+    config.save_config(cfg, Path(cfg.folder), without=[name for _, name, *_ in KEYS])
+    try:
+        trainer.fit(surrogate, datamodule=data)
+    finally:
+        data.teardown("fit")
+    return monitor.rows

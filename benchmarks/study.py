@@ -149,36 +149,3 @@ def dots_legend(figure: Any, filled: str, hollow: str) -> None:
     faces = {filled: "0.4", hollow: "white"}
     handles = [Line2D([], [], mfc=face, label=words, **style) for words, face in faces.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
-
-
-def place_labels(ax: Any, labels: Sequence[Any]) -> None:
-    """Move annotations of points next to them, where they cover no line, point or other label.
-
-    Candidates are places around the point, on two squares. That with the fewest covered places
-    counts, then the nearest.
-    """
-    ax.figure.draw_without_rendering()
-    pixel = ax.figure.dpi / 72
-    gap, places = 5 * pixel, []
-    for line in ax.lines:
-        ends = ax.transData.transform(line.get_xydata())
-        places += [ends, *(np.linspace(a, b, 50) for a, b in itertools.pairwise(ends))]
-    spots = np.concatenate(places)
-    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    ring /= np.abs(ring).max(axis=1, keepdims=True)
-    placed: list[tuple[Array, Array]] = []  # centres and half sizes
-    for label in labels:
-        extent, at = label.get_window_extent(), ax.transData.transform(label.xy)
-        half = np.array([extent.width, extent.height]) / 2
-        best: tuple[float, Array] | None = None
-        for centre in (at + far * (half + 1.5 * gap) * one for far in (1.0, 1.5) for one in ring):
-            cost = np.linalg.norm(centre - at) / 100 / gap
-            cost += (np.abs(spots - centre) < half + 0.6 * gap).all(axis=1).sum()
-            cost += 1000 * sum((np.abs(centre - c) < half + h).all() for c, h in placed)
-            cost += 1000 * (not ax.bbox.x0 < centre[0] - half[0] < ax.bbox.x1 - 2 * half[0])
-            if best is None or cost < best[0]:
-                best = float(cost), centre
-        assert best is not None
-        label.set_position((best[1] - at) / pixel)
-        placed.append((best[1], half))

@@ -4,50 +4,33 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
-ENDING = (signal.SIGTERM, signal.SIGHUP)  # end the process; SIGINT lets it finish its step
-
-
-class Interrupted(KeyboardInterrupt):
-    """This process was interrupted while a script ran; the script has ended."""
 
 
 def run_script(name: str, arguments: Sequence[str]) -> int:
     """Run a script and return its exit status.
 
-    The script is in a session of its own, so that Ctrl-C reaches it once, through this process.
+    The script is in a session of its own, so that Ctrl-C reaches it once, through this process,
+    which waits until it has finished its step. SIGTERM and SIGHUP act as Ctrl-C.
     """
     path = os.pathsep.join(filter(None, [str(SCRIPTS.parent), os.environ.get("PYTHONPATH")]))
+    ending = (signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, signal.default_int_handler) for number in ending}
     process = subprocess.Popen(
         [sys.executable, str(SCRIPTS / f"{name}.py"), *arguments],
         env={**os.environ, "PYTHONPATH": path},
         stdin=subprocess.DEVNULL,
         start_new_session=True,
     )
-    with _forwarded(process) as received:
-        status = process.wait()
-    if received:
-        raise Interrupted(f"signal {received[0]}")
-    return status
-
-
-@contextmanager
-def _forwarded(process: "subprocess.Popen[bytes]") -> Iterator[list[int]]:
-    """Pass signals on to a process; the list contains those that were received."""
-    received: list[int] = []
-
-    def forward(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        process.send_signal(number)
-
-    before = {number: signal.signal(number, forward) for number in (signal.SIGINT, *ENDING)}
     try:
-        yield received
+        return process.wait()
+    except KeyboardInterrupt:
+        process.send_signal(signal.SIGINT)
+        process.wait()
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -1,4 +1,8 @@
-"""Errors of networks that were trained on one family of loads and are tested on all of them."""
+"""Test networks on the loads of other families: python scripts/transfer.py run=runs/families.
+
+The folder has a folder for each family with the runs of its networks, FAMILY/NETWORK. All runs
+have the same body. Test loads are those of the data sets of the runs.
+"""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -6,9 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from omegaconf import DictConfig
 
-from benchmarks.study import picture
-from dpl import Sample, Scene
+from benchmarks import CONF
+from benchmarks.methods import load_runs
+from benchmarks.samples import first
+from benchmarks.study import picture, record
+from dpl import Sample, Scene, config
+from dpl.commands.cli import command
 from dpl.evaluation.tables import share
 from dpl.inference import default_hybrid
 from dpl.inference.hybrid import Predict
@@ -109,3 +118,37 @@ def draw(rows: Sequence[Transfer], path: Path) -> None:
             ax.remove()
         figure.supxlabel("tested on", fontsize=8.5)
         figure.supylabel("trained on", fontsize=8.5)
+
+
+KEYS = ((Sequence[str] | None, "families"), (str, "name"), (int, "count", 1, 10**6))
+
+
+@command("transfer", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Measure all networks of all families on the test loads of all families."""
+    found = {path.parents[1].name for path in Path(cfg.run).glob("*/*/config.yaml")}
+    if not found:
+        raise config.ConfigError(
+            f"run = {cfg.run} contains no runs; train some with run={cfg.run}/FAMILY/NETWORK"
+        )
+    families = cfg.families or sorted(found, key=lambda name: (name == "mixture", name))
+    runs = {name: load_runs(Path(cfg.run) / name, cfg.networks) for name in families}
+    scenes, tests = {}, {}
+    for name, own in runs.items():
+        first_run, surrogate = next(iter(own.values()))
+        scenes[name] = surrogate.scene
+        data = config.load_data(first_run, surrogate.scene)
+        tests[name] = first(data.samples("test"), cfg.count)
+    if lines := differences(scenes):
+        raise config.ConfigError(f"run = {cfg.run}: the bodies of the families differ; {lines[0]}")
+    newton = {name: newton_iterations(scenes[name], test) for name, test in tests.items()}
+
+    def rows() -> Iterator[Transfer]:
+        for family, own in runs.items():
+            for network, (_, surrogate) in own.items():
+                print(f"{family}/{network} ...", flush=True)
+                predict, scene = surrogate.predict, surrogate.scene
+                yield from measure(network, family, predict, scene, tests, newton)
+
+    title = "networks on the loads of other families, 1 thread"
+    record(rows(), Path(cfg.folder) / cfg.name, title, draw)

@@ -5,6 +5,6 @@ from pathlib import Path
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))  # `benchmarks` is not installed
-    from benchmarks.commands.verify import main
+    from benchmarks.verify import main
 
     main()

@@ -150,19 +150,3 @@ def run_case(case: Case) -> tuple[CaseResult, Outcome]:
         time.perf_counter() - start,
     )  # fmt: skip
     return line, outcome
-
-
-def comparisons(case: Case, outcome: Outcome) -> list[Comparison]:
-    """Return the rows of an outcome for numbers.csv."""
-    return [
-        Comparison(
-            case.name,
-            case.description,
-            row.quantity,
-            row.reference,
-            row.value,
-            row.difference,
-            row.holds,
-        )
-        for row in outcome.rows
-    ]

@@ -9,8 +9,9 @@ import os
 import re
 import signal
 import sys
+import textwrap
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
 from dpl import config
-from dpl.commands import dry_run, help_text
+from dpl.commands import dry_run, overrides
 from dpl.config import CONF, ConfigError, Keys
 from dpl.system.files import DataSetError
 from dpl.version import install
@@ -32,6 +33,14 @@ OmegaConf.register_new_resolver(
 )
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
+WIDTH = 100  # columns
+FLAGS = """
+Flags:
+
+  -m                run a job for each combination of values: -m loss=mse,lr_star seed=0,1
+  --cfg job         print the whole configuration with the values of this command line and exit
+  --config-dir DIR  also search DIR for options of groups
+  --hydra-help      print the other flags, which are those of Hydra"""
 
 
 def command(
@@ -67,7 +76,7 @@ def command(
                 with dry_run.initialized(args) as engine:
                     if args.help:
                         about = sys.modules[task.__module__].__doc__ or ""
-                        page = help_text.page(args.config_name, about, args.overrides)
+                        page = help_page(args.config_name, about, args.overrides)
                         return print(page, flush=True)
                     cfg = dry_run.check(args, rehearse, keys)
                     if not args.cfg and args.info is None:
@@ -77,6 +86,40 @@ def command(
         return main
 
     return decorate
+
+
+def help_page(name: str, about: str, lines: Sequence[str]) -> str:
+    """Return the help of a command, see `dpl.commands.overrides` for Hydra's state.
+
+    Args:
+        name: Name of the command's configuration.
+        about: Docstring of the command's module.
+        lines: Overrides. The files are those of the chosen options.
+
+    Raises:
+        ConfigError: An override cannot be applied.
+    """
+    single = [line for line in lines if not overrides.parsed(line).is_sweep_override()]
+    cfg = overrides.composed(name, single)
+    chosen = {k: v for k, v in cfg.hydra.runtime.choices.items() if not k.startswith("hydra")}
+    text = [*about.splitlines()]
+    if chosen:
+        text += ["", "GROUP=OPTION chooses an option of a group; * is chosen:", ""]
+    for group, option in sorted(chosen.items()):
+        names = (f"{one}*" if one == option else one for one in overrides.options(name, group))
+        text += textwrap.wrap(
+            f"{group:14} {', '.join(names)}", WIDTH, initial_indent="  ",
+            subsequent_indent=" " * 17, break_on_hyphens=False,
+        )  # fmt: skip
+    text += ["", "KEY=VALUE changes a value, +KEY=VALUE adds one, ~KEY removes one."]
+    folders = [Path(s.path) for s in cfg.hydra.runtime.config_sources if s.schema == "file"]
+    for part in overrides.defaults(name, single):
+        paths = (folder / f"{part.config_path}.yaml" for folder in folders)
+        if path := next(filter(Path.is_file, paths), None):
+            place = f"keys of {part.package}" if part.package else "keys"
+            text += ["", f"{place}, {part.config_path}.yaml:", ""]
+            text += textwrap.indent(path.read_text(encoding="utf-8").rstrip(), "  ").splitlines()
+    return "\n".join([*text, *FLAGS.splitlines()])
 
 
 @contextlib.contextmanager

@@ -1,19 +1,20 @@
 """Compose and check all jobs of a command line before Hydra starts the first one."""
 
 import contextlib
-import itertools
 import logging
-import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path, get_args_parser, run_and_report
+from hydra._internal.utils import create_config_search_path, get_args_parser
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import configure_log
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -22,7 +23,6 @@ from dpl import config
 from dpl.commands import overrides
 from dpl.config import ConfigError
 
-BASIC = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
 REMOTE = "submitit"  # launchers on other machines, whose hardware may differ
 SAME = ("seed", "run", "folder")  # keys on which the validity of a job does not depend
 
@@ -68,6 +68,7 @@ def initialized(args: Namespace) -> Iterator[Hydra]:
         yield engine
     finally:
         GlobalHydra.instance().clear()
+        HydraConfig.instance().cfg = None  # set by a job whose folder cannot be made
 
 
 def check(
@@ -87,16 +88,19 @@ def check(
         The configuration of a single job with the node `hydra`, None for a sweep.
 
     Raises:
-        ConfigError: An override, a job or its folder is invalid.
+        ConfigError: An override or a job is invalid.
     """
     first, jobs = _jobs(args)
     if args.cfg or args.info is not None:
         return None
-    place = _folder(first, "run" if jobs is None else "sweep")
-    every = [overrides.job(cfg) for cfg in ([first] if jobs is None else jobs)]
+    with config.error_in("run", OmegaConfBaseException):
+        first.hydra.run.dir  # noqa: B018  # raises if `run` is no text
+    every = [overrides.job(cfg) for cfg in jobs or [first]]
     for cfg in every:
         config.check(cfg, keys=keys)
-    if jobs is not None and rehearse is not None and REMOTE not in str(first.hydra.launcher):
+    if jobs is None:
+        return first
+    if rehearse is not None and REMOTE not in str(first.hydra.launcher):
         different = {
             str({k: v for k, v in OmegaConf.to_container(cfg).items() if k not in SAME}): cfg
             for cfg in every
@@ -107,8 +111,7 @@ def check(
                 rehearse(cfg)
         finally:
             logging.disable(logging.NOTSET)
-    try_folder(place)
-    return first if jobs is None else None
+    return None
 
 
 def run(
@@ -122,19 +125,17 @@ def run(
         every = map(overrides.parsed, args.overrides)
         fixed = [f"'{one.key_or_group}'" for one in every if not one.is_sweep_override()]
         names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]"
-        lines = [*args.overrides, "hydra.mode=MULTIRUN", names]
-        run_and_report(lambda: engine.multirun(args.config_name, task, lines))
+        engine.multirun(args.config_name, task, [*args.overrides, "hydra.mode=MULTIRUN", names])
     else:
         configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
         engine.compose_config = lambda **_: cfg
-        run_and_report(lambda: engine.run(args.config_name, task, args.overrides))
+        engine.run(args.config_name, task, args.overrides)
 
 
 def _jobs(args: Namespace) -> tuple[DictConfig, list[DictConfig] | None]:
     """Return the configuration without swept keys and the configurations of the jobs of a sweep.
 
-    The jobs of a search are not known in advance. They are represented by one job for each end or
-    option of each range, with the first values of the other ranges.
+    The jobs of a search are not known in advance: one without the searched keys represents them.
     """
     every = [overrides.parsed(line) for line in args.overrides]
     fixed = [one.input_line for one in every if not one.is_sweep_override()]
@@ -147,44 +148,11 @@ def _jobs(args: Namespace) -> tuple[DictConfig, list[DictConfig] | None]:
                 "other, or write a list as [a,b]"
             )
         return first, None
+    if first.hydra.sweeper._target_ != f"{BasicSweeper.__module__}.{BasicSweeper.__name__}":
+        return first, [first]
     given = {one.key_or_group for one in every}
     params = first.hydra.sweeper.get("params") or {}
     swept += [overrides.parsed(f"{k}={v}") for k, v in params.items() if k not in given]
-    search = first.hydra.sweeper._target_ != BASIC
-    values = [overrides.values(one, search=search) for one in swept]
-    chosen = _one_by_one(values) if search else itertools.product(*values)
-    return first, [overrides.composed(args.config_name, [*fixed, *job]) for job in chosen]
-
-
-def _one_by_one(values: list[list[str]]) -> Iterator[tuple[str, ...]]:
-    """Yield the first values of all keys, then each other value with the first of the others."""
-    first = tuple(some[0] for some in values)
-    yield first
-    for place, some in enumerate(values):
-        for value in some[1:]:
-            yield (*first[:place], value, *first[place + 1 :])
-
-
-def _folder(cfg: DictConfig, mode: str) -> Path:
-    """Return the folder of a run or a sweep, which depends on `run`."""
-    try:
-        return Path(cfg.hydra[mode].dir)
-    except OmegaConfBaseException:
-        run = OmegaConf.to_container(cfg, resolve=False)["run"] or "null"
-        raise ConfigError(f"run = {run} must be a text, the name of a folder") from None
-
-
-def try_folder(folder: Path) -> None:
-    """Create a folder and a file in it, and remove both; raise a `ConfigError` if that fails."""
-    new = [path for path in (folder, *folder.parents) if not path.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ConfigError(
-            f"run = {folder} cannot be written: {error.strerror}; name another folder"
-        ) from error
-    finally:
-        for path in filter(Path.is_dir, new):
-            path.rmdir()
+    with config.error_in("hydra/sweeper", HydraException):
+        (jobs,) = BasicSweeper.split_arguments(swept, None)
+    return first, [overrides.composed(args.config_name, [*fixed, *job]) for job in jobs]

@@ -9,11 +9,9 @@ import time
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig
 
-import dpl
 from dpl import config, export, training
 from dpl.commands.cli import command
 from dpl.evaluation import tables
@@ -70,26 +68,37 @@ def publish(cfg: DictConfig, run: DictConfig, scene: "dpl.Scene", folder: Path) 
 
 
 def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder: Path) -> None:
-    """Write the graph and its folder, compare the graph with torch, and measure latencies."""
-    from dpl.export.metadata import describe, solve_reference
+    """Write the graph and its folder, and compare the graph with torch."""
+    from dpl.export import comparison
+    from dpl.export.folder import MODEL
+    from dpl.export.onnx_graph import PACKAGES
 
-    path = folder / "model.onnx"
-    start = time.perf_counter()
+    path, start = folder / MODEL, time.perf_counter()
     with config.error_in("run"):
         graph = export.ExportGraph(surrogate)
         export.export_onnx(graph, path)
     seconds = time.perf_counter() - start
-    reference, entry = solve_reference(graph)
-    meta = describe(graph, path, entry, tol=cfg.tol, errors=_test_errors(Path(cfg.run)))
-    export.write_folder(folder, surrogate, reference, meta)
-    report = _report(cfg, graph, export.OnnxSession(path), path) | {
-        "export_seconds": round(seconds, 2)
+    export.write_folder(graph, folder, tol=cfg.tol, errors=_test_errors(Path(cfg.run)))
+    loads = comparison.sample_check_loads(surrogate.scene, cfg.samples)
+    rows = comparison.compare_outputs(graph, export.OnnxSession(path), loads)
+    tables.show(rows, "ONNX against torch")
+    largest = max(row.max_error for row in rows)
+    size = sum(file.stat().st_size for file in folder.glob(f"{MODEL}*"))
+    report = {
+        "network": type(surrogate.net).__name__,
+        "passed": largest <= cfg.tol,
+        "tolerance": cfg.tol,
+        "largest_error": largest,
+        "loads": [asdict(row) for row in rows],
+        "bytes": size,
+        "export_seconds": round(seconds, 2),
+        "machine": tables.machine(),
+        "versions": {name: version(name) for name in ("torch", *PACKAGES)},
     }
     with atomic_write(folder / "report.json") as file:
         file.write((json.dumps(report, indent=1) + "\n").encode())
-    largest = report["largest_error"]
-    if not report["passed"]:
-        for part in folder.glob("model.onnx*"):
+    if largest > cfg.tol:
+        for part in folder.glob(f"{MODEL}*"):
             part.unlink()
         print(
             f"error: ONNX and torch differ by {largest:.2g}, more than tol = {cfg.tol:g}; {path} "
@@ -97,48 +106,7 @@ def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder
             file=sys.stderr,
         )
         sys.exit(1)
-    megabytes = report["bytes"] / 1e6
-    print(f"largest difference {largest:.1e}; {path}, {megabytes:.3g} MB, {seconds:.1f} s to write")
-
-
-def _report(
-    cfg: DictConfig, graph: "export.ExportGraph", session: "export.OnnxSession", path: Path
-) -> dict[str, Any]:
-    """Measure and print differences and latencies; return them with versions and file size."""
-    from dpl.evaluation import timing
-    from dpl.export import comparison
-    from dpl.export.onnx_graph import PACKAGES
-
-    surrogate = graph.surrogate
-    loads = comparison.sample_check_loads(surrogate.scene, cfg.samples)
-    differences = comparison.compare_outputs(graph, session, loads)
-    stored = export.read_reference(path.parent)
-    found = session(**{name: stored[name] for name in graph.inputs})
-    distance = comparison.relative_differences(found, stored["displacement"])
-    reference_error = float(distance.max())
-    largest = max(reference_error, *(row.max_error for row in differences))
-    times = comparison.measure_latency(graph, session, loads, calls=cfg.repeats)
-    sample = surrogate.scene.loads.sample(comparison.CHECK_STREAM, range(cfg.samples))
-    latencies = timing.latencies(dpl.Simulator(surrogate), sample)
-    tables.show(differences, "ONNX against torch")
-    tables.show(times, "network, loads in the training range [ms], 1 thread")
-    print(timing.describe(latencies))
-    return {
-        "network": type(surrogate.net).__name__,
-        "passed": largest <= cfg.tol,
-        "tolerance": cfg.tol,
-        "largest_error": largest,
-        "reference_error": reference_error,
-        "loads": [asdict(row) for row in differences],
-        "milliseconds": [asdict(row) for row in times],
-        "latency": {name: asdict(one) for name, one in latencies.items()},
-        "threads": 1,
-        "repeats": cfg.repeats,
-        "bytes": sum(file.stat().st_size for file in path.parent.glob("model.onnx*")),
-        "opset": export.onnx_opset(path),
-        "machine": tables.machine(),
-        "versions": {name: version(name) for name in ("torch", *PACKAGES)},
-    }
+    print(f"largest difference {largest:.1e}; {path}, {size / 1e6:.3g} MB, {seconds:.1f} s")
 
 
 def _test_errors(folder: Path) -> dict[str, float] | None:

@@ -73,7 +73,6 @@ def composed(name: str, lines: Sequence[str]) -> DictConfig:
     try:
         cfg = hydra.compose(name, overrides=list(lines), return_hydra_config=True)
     except REFUSED as error:
-        _check_options(name, lines)
         _check_spelling(name, lines, str(error))
         raise ConfigError(_in_one_line(str(error))) from error
     keys = {line[1:].lstrip("+").partition("=")[0] for line in lines if line[0] == "+"}
@@ -91,15 +90,6 @@ def job(cfg: DictConfig) -> DictConfig:
     if "folder" in found and OmegaConf.is_interpolation(found, "folder"):
         found.folder = "."
     return found
-
-
-def _check_options(name: str, lines: Sequence[str]) -> None:
-    """Raise a `ConfigError` if the option of a group is a number or null."""
-    for one in map(parsed, lines):
-        known = options(name, one.key_or_group)
-        if known and not one.is_delete() and not isinstance(one.value(), str | list):
-            remedy = f"~{one.key_or_group} leaves it out"
-            raise ConfigError(f"{one.input_line} must be one of {', '.join(known)}; {remedy}")
 
 
 def _check_spelling(name: str, lines: Sequence[str], message: str) -> None:
@@ -125,20 +115,3 @@ def _in_one_line(message: str) -> str:
         if f"'{group}/" in text:
             text += f"; more come with {install(extra)}"
     return text
-
-
-def values(one: Override, *, search: bool) -> list[str]:
-    """Return one override for each value of a sweep, and for the ends of a range in a search."""
-    if one.is_discrete_sweep():
-        found = list(one.sweep_string_iterator())
-    elif search and one.is_interval_sweep():
-        interval: Any = one.value()
-        found = [interval.start, interval.end]
-    else:
-        raise ConfigError(
-            f"{one.input_line} is a range for a search; name its values, or add "
-            "hydra/sweeper=optuna"
-        )
-    if not found:
-        raise ConfigError(f"{one.input_line} must name one value or more; it names none")
-    return [f"{one.get_key_element()}={value}" for value in found]

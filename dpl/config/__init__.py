@@ -32,8 +32,6 @@ if TYPE_CHECKING:
         PREDICTION,
         load_data,
         load_run,
-        load_runs,
-        training_loads,
         with_copied_files,
     )
     from dpl.config.validation import ConfigError, Keys

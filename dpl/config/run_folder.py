@@ -1,11 +1,10 @@
 """Read the folder of a training run."""
 
 import contextlib
-import json
 import os
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -210,45 +209,8 @@ def _local(folder: str) -> Iterator[str | Path]:
         yield shutil.copytree(found, Path(copy) / "run")
 
 
-def load_runs(
-    folder: str | Path, names: Sequence[str] | None = None, *, trust: bool = False
-) -> dict[str, tuple[DictConfig, "training.TrainedSurrogate"]]:
-    """Return the configurations and surrogates of named runs in a folder, or of all.
-
-    Runs whose configurations have the same keys of the scene share one scene.
-
-    Raises:
-        ConfigError: There are none, or one cannot be used or belongs to another scene.
-    """
-    if names is None:
-        names = sorted(path.parent.name for path in Path(folder).glob("*/config.yaml"))
-    if not names:
-        raise ConfigError(f"run = {folder} contains no runs; train some with run={folder}/NAME")
-    runs: dict[str, tuple[DictConfig, training.TrainedSurrogate]] = {}
-    scenes: dict[str, Scene] = {}  # by their part of the configuration
-    for name in names:
-        config, _ = files_of_run(Path(folder) / name)
-        part = {key: node for key, node in read_config(config).items() if key in OF_SCENE}
-        known = scenes.get(key := json.dumps(part))
-        runs[name] = load_run(Path(folder) / name, trust=trust, scene=known)
-        own = scenes.setdefault(key, runs[name][1].scene)
-        first = next(iter(scenes.values()))
-        if own.fingerprint != first.fingerprint:
-            differences = "; ".join(first.differences(own.identity()))
-            raise ConfigError(
-                f"run = {folder}: {name} is of another scene than {names[0]}: {differences}"
-            )
-    return runs
-
-
 def load_data(cfg: DictConfig, scene: Scene) -> "data.DataModule":
     """Return the data set of a training run on its scene; missing loads are solved."""
     found: data.DataModule = instantiate(cfg, "data", scene=scene)
     found.prepare_data()
     return found
-
-
-def training_loads(cfg: DictConfig) -> int | None:
-    """Return the number of training loads in a configuration from `load_run`; None for a stream."""
-    train = cfg.data.train
-    return train if isinstance(train, int) else None

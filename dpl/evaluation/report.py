@@ -23,7 +23,7 @@ from dpl.evaluation.tables import (
     show_cells,
     simulator_row,
 )
-from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
+from dpl.evaluation.timing import Latency, latencies, percentiles, time_interleaved
 from dpl.fem import (
     LinearSolver,
     Load,
@@ -170,7 +170,7 @@ def evaluate(
     rows = [replace(row, latency=latency) if row.solver == PREDICTION else row for row in rows]
     about = "one at a time, 1 thread; median, worst and estimated error are relative L2"
     show(rows, f"{len(test.force)} test loads, {about}")
-    print(describe(latency))
+    print(f"latency, 1 thread: {'; '.join(f'{name} {one}' for name, one in latency.items())}")
     save(rows, folder / "evaluation.json")
     _draw(surrogate, test, displacements, folder)
     return rows

@@ -76,12 +76,6 @@ def latencies(simulator: Simulator, load: Load) -> dict[str, Latency]:
     }
 
 
-def describe(measured: Mapping[str, Latency]) -> str:
-    """Return latencies as one line."""
-    described = "; ".join(f"{name} {one}" for name, one in measured.items())
-    return f"latency, 1 thread: {described}"
-
-
 def time_interleaved(
     solvers: Mapping[K, Solver], load: Load, tick: Callable[[], None] = lambda: None
 ) -> dict[K, tuple[Solution, Tensor]]:

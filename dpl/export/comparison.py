@@ -1,4 +1,4 @@
-"""Comparison of an ONNX graph with its surrogate: largest differences and latencies."""
+"""Comparison of an ONNX graph with its surrogate: largest differences."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.evaluation import latency
 from dpl.export.onnx_graph import Array, ExportGraph, OnnxSession
 from dpl.fem import Load
 from dpl.scene import Scene
@@ -16,7 +15,6 @@ CHECK_STREAM = (0, 11)  # random stream of the loads of the comparison
 IN_RANGE = "in range"
 AMPLITUDES = {"small": 1e-3, "tiny": 1e-9, "large": 10.0}  # factors on loads in the training range
 N_OUTSIDE = 4  # loads of each kind outside the training range
-BATCHES = (1, 32)  # batch sizes for which times are measured
 
 
 class CheckLoads(NamedTuple):
@@ -48,23 +46,6 @@ class OutputDifference:
     kind: str
     n_loads: int
     max_error: float
-
-
-@dataclass(frozen=True)
-class BatchLatency:
-    """Latency of the network without the checks of the simulator, see `dpl.evaluation.timing`.
-
-    Attributes:
-        batch: Loads per call.
-        torch_p50, torch_p99: Percentiles of the wall time of a call of the surrogate [ms].
-        onnxruntime_p50, onnxruntime_p99: The same of the graph [ms].
-    """
-
-    batch: int
-    torch_p50: float
-    torch_p99: float
-    onnxruntime_p50: float
-    onnxruntime_p99: float
 
 
 def sample_check_loads(scene: Scene, count: int) -> CheckLoads:
@@ -123,22 +104,3 @@ def relative_differences(found: Array, expected: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(difference == 0, 0.0, difference / size)
     return np.where(np.isfinite(ratio), ratio, np.inf)
-
-
-def measure_latency(
-    graph: ExportGraph, session: OnnxSession, loads: CheckLoads, *, calls: int
-) -> list[BatchLatency]:
-    """Return latencies of surrogate and graph on loads in the training range, `calls` or more."""
-    usual = [k for k, kind in enumerate(loads.kinds) if kind == IN_RANGE]
-    rows = []
-    for batch in BATCHES:
-        size = min(batch, len(usual))
-        starts = range(0, len(usual) - size + 1, size)
-        inputs = [loads.select(usual[start : start + size]) for start in starts]
-        arrays = [{name: column.numpy() for name, column in part.items()} for part in inputs]
-        repeats = -(-calls // len(inputs))
-        surrogate = latency(lambda part: graph.surrogate(**part), inputs, repeats=repeats)
-        onnx = latency(lambda part: session(**part), arrays, repeats=repeats)
-        times = (surrogate.p50, surrogate.p99, onnx.p50, onnx.p99)
-        rows.append(BatchLatency(size, *(round(time, 4) for time in times)))
-    return rows

@@ -5,77 +5,210 @@
     meta.json            mesh, order of the degrees of freedom, scales, units, range, errors
     modes.f64            largest modal loads of the training, see `range` in meta.json
     reference/*.f64      a load, the surrogate's displacement and the finite-element displacement
-    report.json          differences between ONNX and torch, and latencies
+    report.json          differences between ONNX and torch
 
 Files `*.f64` hold raw numbers: float64, little-endian, last axis fastest. meta.json has the shapes.
 """
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from dpl.export.metadata import FORMAT
-from dpl.export.onnx_graph import Array
-from dpl.fem import HasModes
+from dpl.export.comparison import CHECK_STREAM
+from dpl.export.onnx_graph import Array, ExportGraph
+from dpl.fem import HasModes, Problem, evaluate_solution, solve, surface
+from dpl.fem.mesh.writing import flat_cells
+from dpl.fem.postprocess import triangles
+from dpl.scene import Scene
 from dpl.system.files import atomic_write
 from dpl.training import TrainedSurrogate, checkpoints
+from dpl.version import __version__
 
-RAW = np.dtype("<f8")
+FORMAT = 4  # version of the keys of meta.json
+MODEL = "model.onnx"
+RANGE = (
+    "f: a force over E L^(D-1), minus `constant_force`, and 0 at fixed degrees of freedom. "
+    "q: the least-squares fit of `modes` to f at the nodes where f is not zero. "
+    "In range: max |q| <= 1 and |f - modes q| <= 1e-3 |f| at these nodes. "
+    "Without a fit: |f| above `largest_force` is out of range."
+)
 
 
 def write_folder(
-    folder: Path,
-    surrogate: TrainedSurrogate,
-    reference: Mapping[str, Array],
-    meta: Mapping[str, Any],
+    graph: ExportGraph, folder: Path, *, tol: float, errors: Mapping[str, Any] | None
 ) -> None:
-    """Write all files except the graph and the report.
+    """Write all files except the report for a graph that lies in the folder.
 
-    `reference` are the arrays of `solve_reference`, `meta` the contents of meta.json.
+    Args:
+        graph: The graph.
+        folder: The folder, with model.onnx.
+        tol: Largest relative difference of ONNX and torch [-].
+        errors: Errors on the test set, see `dpl.training.metrics`, if the run was evaluated.
     """
-    scene, loads = surrogate.scene, surrogate.scene.loads
+    scene, loads = graph.surrogate.scene, graph.surrogate.scene.loads
     (folder / "reference").mkdir(parents=True, exist_ok=True)
-    for name, field in reference.items():
-        write_raw(folder / "reference" / f"{name}.f64", field)
+    fields, reference = _solve_reference(graph)
+    for name, field in fields.items():
+        _write_raw(folder / "reference" / f"{name}.f64", field)
     if isinstance(loads, HasModes):
-        write_raw(folder / "modes.f64", loads.modal_forces.numpy())
-    weights = folder / "weights.safetensors"
-    entries = checkpoints.entries_of_scene(scene)
-    checkpoints.write({"state_dict": surrogate.state_dict(), **entries}, weights)
+        _write_raw(folder / "modes.f64", loads.modal_forces.numpy())
+    weights = {"state_dict": graph.surrogate.state_dict(), **checkpoints.entries_of_scene(scene)}
+    checkpoints.write(weights, folder / "weights.safetensors")
+    meta = _describe(graph, folder / MODEL, tol) | {"errors": errors, "reference": reference}
     lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in meta.items())
     with atomic_write(folder / "meta.json") as file:
         file.write(("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
 
-def write_raw(path: Path, field: Array) -> None:
+def _write_raw(path: Path, field: Array) -> None:
     """Write an array as raw float64, little-endian, last axis fastest."""
     with atomic_write(path) as file:
-        file.write(np.ascontiguousarray(field, dtype=RAW).tobytes())
+        file.write(np.ascontiguousarray(field, dtype="<f8").tobytes())
 
 
-def read_raw(path: Path, shape: list[int]) -> Array:
-    """Return an array that `write_raw` wrote; raise ValueError if its size is not the shape's."""
-    return np.fromfile(path, dtype=RAW).astype(np.float64).reshape(shape)
-
-
-def read_metadata(folder: Path) -> dict[str, Any]:
-    """Return the contents of meta.json; raise ValueError if it has another format version."""
-    meta: dict[str, Any] = json.loads((folder / "meta.json").read_text())
-    if meta.get("format") != FORMAT:
-        raise ValueError(
-            f"{folder / 'meta.json'}: format = {meta.get('format')} must be {FORMAT}; export the "
-            "run again"
-        )
-    return meta
-
-
-def read_reference(folder: Path) -> dict[str, Array]:
-    """Return inputs and displacements of the reference load, by name."""
-    shapes = read_metadata(folder)["reference"]["shapes"]
+def _describe(graph: ExportGraph, path: Path, tol: float) -> dict[str, Any]:
+    """Return the contents of meta.json without errors and reference."""
+    module, scene = graph.surrogate, graph.surrogate.scene
+    loads, problem = scene.loads, scene.problem
+    law_ranges = problem.material.parameter_ranges
+    count = sum(parameter.numel() for parameter in module.net.parameters())
     return {
-        name: read_raw(folder / "reference" / f"{name}.f64", shape)
-        for name, shape in shapes.items()
+        "format": FORMAT,
+        "dpl": __version__,
+        "scene": scene.fingerprint,
+        "network": {"name": type(module.net).__name__, "parameters": count},
+        "model": {**_model(graph, path), "tolerance": tol},
+        "units": {"length": "m", "force": _force_unit(scene), "stress": "Pa", "young": "Pa"},
+        "dofs": {
+            "count": problem.free.numel(),
+            "order": "node-major: D * node + component; components x, y, z",
+            "fixed": _indices(~problem.free),
+            "loadable": _indices(loads.loadable_dofs),
+        },
+        "scales": _scales(module),
+        "material": {**_law(scene), "young": loads.moduli, **law_ranges},
+        "range": _range(scene),
+        "mesh": _mesh(problem),
+    }
+
+
+def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
+    """Return file and operator set, and name, shape, type and unit of each input and output."""
+    import onnx
+
+    stored = onnx.load(str(path), load_external_data=False)
+    scene = graph.surrogate.scene
+    problem, young = scene.problem, scene.loads.moduli[1]
+    units = problem.material.units_of_ranges.items()
+    pascals = {name for name, unit in units if unit and math.isclose(unit * young, 1)}
+    pascals.update(problem.follower_loads.ranges)
+    loads, field = scene.loads, ["B", *scene.problem.shape]
+    known: dict[str, dict[str, Any]] = {
+        "force": {"shape": field, "type": "float64", "unit": _force_unit(scene)},
+        "young": {
+            "shape": ["B"],
+            "type": "float64",
+            "unit": "Pa",
+            "range": loads.moduli,
+            "distribution": "log" if loads.moduli.is_log else "uniform",
+        },
+        "parameters": {
+            "shape": ["B", len(loads.parameter_ranges)],
+            "type": "float64",
+            "unit": ["Pa" if name in pascals else "1" for name in loads.parameter_ranges],
+            "ranges": loads.parameter_ranges,
+        },
+        "displacement": {"shape": field, "type": "float64", "unit": "m"},
+    }
+    both = {"inputs": graph.inputs, "outputs": graph.outputs}
+    named = {key: [{"name": name, **known[name]} for name in names] for key, names in both.items()}
+    return {"file": path.name, "opset": int(stored.opset_import[0].version), **named}
+
+
+def _scales(module: TrainedSurrogate) -> dict[str, Any]:
+    return {
+        "length": module.scene.length,
+        "force_unit": module.scene.force_unit,
+        "force": float(module.predictor.force_scale),
+        "displacement": float(module.predictor.displacement_scale),
+        "meaning": module.predictor.meaning,
+    }
+
+
+def _force_unit(scene: Scene) -> str:
+    return "N" if scene.problem.shape[1] == 3 else "N/m"
+
+
+def _indices(mask: Tensor) -> list[int]:
+    return mask.flatten().nonzero()[:, 0].tolist()
+
+
+def _law(scene: Scene) -> dict[str, Any]:
+    law = scene.problem.material.identity()
+    return {"name": law.pop("name"), "parameters_over_E": law}
+
+
+def _range(scene: Scene) -> dict[str, Any]:
+    """Return the data by which a program checks whether a force is in the training range."""
+    loads, constant = scene.loads, scene.loads.constant_force
+    found = {
+        "family": loads.identity(),
+        "constant_force": None if constant is None else constant.flatten().tolist(),
+        "largest_force": loads.largest_force,
+        "meaning": RANGE,
+    }
+    if isinstance(loads, HasModes):
+        found["modes"] = {"file": "modes.f64", "shape": list(loads.modal_forces.shape)}
+    return found
+
+
+def _mesh(problem: Problem) -> dict[str, Any]:
+    kind, cells = flat_cells(problem.mesh, len(problem.points))
+    return {
+        "points": (problem.length * (problem.points.numpy() + problem.origin)).tolist(),
+        "cell_type": kind,
+        "cell_order": "VTK",
+        "cells": cells.tolist(),
+        "triangles": triangles(surface(problem.mesh)).tolist(),
+    }
+
+
+def _solve_reference(
+    graph: ExportGraph, *, max_loads: int = 16
+) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Return the first random load for which Newton converges, and its entry in meta.json.
+
+    Of `max_loads` loads the last one is taken in any case.
+
+    Returns:
+        Arrays by file name: the inputs of the graph with B = 1, `displacement` of the surrogate
+        and `fe_displacement`, (1, N, D) [m]. The entry has the shapes of the arrays, the relative
+        residuals of both displacements, `fe_converged`, and their relative difference `error` [-].
+    """
+    scene = graph.surrogate.scene
+    for k in range(max_loads):
+        load = scene.loads.sample(CHECK_STREAM, [k])
+        inputs = scene.si_inputs(load)
+        with torch.inference_mode():
+            metres = graph(**inputs)
+        fe = solve(scene.solver, load)
+        if bool(fe.converged):
+            break
+    found = evaluate_solution(scene.problem, metres.clone() / scene.length, load, scene.solver.tol)
+    difference = (found.displacement - fe.displacement).norm() / fe.displacement.norm()
+    displacements = {"displacement": metres, "fe_displacement": scene.length * fe.displacement}
+    fields = {name: field.numpy() for name, field in (inputs | displacements).items()}
+    return fields, {
+        "folder": "reference",
+        "shapes": {name: list(field.shape) for name, field in fields.items()},
+        "residual": float(found.residual),
+        "fe_residual": float(fe.residual),
+        "fe_converged": bool(fe.converged),
+        "error": float(difference),
     }

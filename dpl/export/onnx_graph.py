@@ -131,10 +131,3 @@ class OnnxSession:
         arrays = {name: np.asarray(column) for name, column in inputs.items()}
         found: Array = self._session.run(None, arrays)[0]
         return found
-
-
-def onnx_opset(path: Path) -> int:
-    """Return the operator set version of an ONNX file."""
-    import onnx
-
-    return int(onnx.load(str(path), load_external_data=False).opset_import[0].version)

@@ -83,10 +83,20 @@ COMMANDS = {
     "devices": ([*DEVICE, "networks=[fcnn]"], {"devices_cpu.csv": ("network", ["fcnn"])}),
     "benchmark of latency": (
         ["cases=[latency]", UNROLLED, "samples=2", "repeats=1"],
-        {"latency.csv": ("loads", ["2"])},
+        {
+            "latency.csv": (
+                "call",
+                [
+                    *("prediction", "residual and min det F", "sim(force)"),
+                    *(f"sim(force, {limit})" for limit in ("error=1e-3", "tol=1e-3", "tol=1e-6")),
+                    *(f"sim(force, tol=1e-8, budget_ms={ms})" for ms in (10, 20, 50, 100)),
+                    *("grasp, first frame", "grasp, next frame"),
+                ],
+            )
+        },
     ),
     "benchmark of local loads": (
-        ["cases=[local]", UNROLLED, "count=2", "repeats=1"],
+        ["cases=[local]", UNROLLED, "count=2"],
         {
             "local_loads_unrolled.csv": (
                 "loads",
@@ -105,7 +115,7 @@ def column(path: Path, name: str) -> list[str]:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_writes_its_rows_machine_and_figure(name, trained, script, tmp_path, monkeypatch):
-    monkeypatch.setattr("benchmarks.local_loads.missing_packages", lambda: ["onnx"])
+    monkeypatch.setattr("benchmarks.latency.missing_packages", lambda: ["onnx"])
     arguments, tables = COMMANDS[name]
     ended = script(name.split()[0], *arguments, f"folder={tmp_path}", cwd=trained)
     assert ended.status == 0, ended.err

@@ -48,25 +48,6 @@ def test_a_timed_prediction_is_that_of_the_surrogate_with_repeated_loads(scene, 
     torch.testing.assert_close(found[24:], expected[:6])
 
 
-def test_calls_end_after_the_number_or_the_time():
-    calls = []
-    times, _ = devices.Clock(CPU, 5, 10.0, warm_up=2).times(lambda: calls.append(0))
-    assert (len(times), len(calls)) == (5, 7)
-    times, _ = devices.Clock(CPU, 10**6, 0.02, warm_up=0).times(lambda: calls.append(0))
-    assert len(times) < 10**6
-    times, _ = devices.Clock(CPU, 5, 1e-9, warm_up=0).times(lambda: calls.append(0))
-    assert len(times) == 1, "one call is always timed"
-
-
-def test_a_network_beyond_the_memory_is_named_and_left_out(scene, samples, monkeypatch, capsys):
-    def build(scene, inputs):
-        raise MemoryError("2 parameters need 9 GB, there are 8 GB")
-
-    monkeypatch.setitem(devices.NETWORKS, "fcnn", (build, None))
-    assert list(devices.measure("fcnn", scene, samples, *QUICK)) == []
-    assert capsys.readouterr().out == "left out: fcnn: 2 parameters need 9 GB, there are 8 GB\n"
-
-
 @pytest.mark.parametrize("has_gpu", [False, True])
 def test_auto_takes_a_gpu_if_there_is_one_and_cuda_needs_one(has_gpu, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: has_gpu)

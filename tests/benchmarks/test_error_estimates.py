@@ -57,12 +57,3 @@ def test_quantiles_are_those_of_finite_ratios_of_each_group():
     assert (first.p5, first.median, first.p95) == pytest.approx((1.1, 2.0, 2.9))
     assert (first.least, first.missed) == (pytest.approx(1.0), 0)
     assert (second.least, second.missed) == (pytest.approx(0.2), 1)
-
-
-def test_the_bodies_are_what_their_names_say():
-    scene = error_estimates.bracket()
-    points = scene.problem.points
-    assert not ((points[:, 0] > 0.4) & (points[:, 1] > 0.4)).any(), "the corner is cut out"
-    assert scene.problem.material.poisson == 0.45
-    sides = error_estimates.plate().problem.points
-    assert (sides.amax(0) - sides.amin(0)).tolist() == pytest.approx([1.0, 0.5, 0.02])

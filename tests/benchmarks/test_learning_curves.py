@@ -1,11 +1,9 @@
 """Laws of learning curves."""
 
-import pytest
 from torch.utils.tensorboard import SummaryWriter
 
 from benchmarks import learning_curves
 from benchmarks.learning_curves import ERROR, Validation
-from benchmarks.study import read
 
 
 def write_events(folder, errors, steps=10):
@@ -45,14 +43,3 @@ def test_a_run_with_fewer_than_two_validations_has_no_curve(tmp_path):
     runs = [tmp_path / "once", tmp_path / "unrolled"]
     assert not learning_curves.save(runs, tmp_path / "curves")
     assert not list(tmp_path.glob("curves*"))
-
-
-def test_rows_and_a_picture_are_written(tmp_path):
-    write_events(tmp_path / "fcnn", {0: 0.5, 1: 0.25})
-    write_events(tmp_path / "pod", {0: 0.05, 9: 0.004})
-    runs = [tmp_path / "fcnn", tmp_path / "pod"]
-    assert learning_curves.save(runs, tmp_path / "curves")
-    rows = read(Validation, tmp_path / "curves.csv")
-    assert [row.method for row in rows] == ["fcnn", "fcnn", "pod", "pod"]
-    assert rows[-1].rel_L2_median == pytest.approx(0.004)
-    assert (tmp_path / "curves.png").is_file()

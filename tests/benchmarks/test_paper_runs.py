@@ -13,8 +13,9 @@ import yaml
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from benchmarks import all_results, loss_table, paper_runs, subcommands
-from benchmarks.paper_runs import Run, State
+from benchmarks import loss_table, paper
+from benchmarks.paper import Run, State
+from benchmarks.results import EXPERIMENTS
 from dpl.commands import dry_run
 from dpl.config import CONF
 
@@ -36,7 +37,7 @@ SIZES = {"all": ["trainer.max_epochs=1"], "beam_svk": ["mesh.nodes=[5,3,3]"]}
 
 
 def planned(groups=None, more=()):
-    return {run.path: run for run in paper_runs.planned(PLAN, groups, SIZES, more)}
+    return {run.path: run for run in paper.planned(PLAN, groups, SIZES, more)}
 
 
 # ------------------------------------------------------------------ the plan
@@ -63,30 +64,6 @@ def test_a_recipe_is_combined_with_the_experiment_and_sizes_replace_options():
     assert sum("max_epochs" in one for one in runs["beam_svk/fcnn"].options) == 1
 
 
-def test_sizes_of_a_run_replace_those_of_its_experiment():
-    sizes = SIZES | {"beam_svk/fcnn": ["mesh.nodes=[6,3,3]"]}
-    runs = {run.path: run.options for run in paper_runs.planned(PLAN, ["one"], sizes)}
-    assert "mesh.nodes=[6,3,3]" in runs["beam_svk/fcnn"]
-    assert "mesh.nodes=[5,3,3]" in runs["beam_svk/pod"]
-
-
-def test_a_run_is_repeated_in_folders_with_their_options():
-    plan = {"a": PLAN["one"] | {"folders": {"x": ["loads=x"], "y": ["trainer.max_epochs=2"]}}}
-    runs = {run.path: run.options for run in paper_runs.planned(plan, None, {})}
-    assert [path for path in runs if path.startswith("beam_svk/")] == [
-        *("beam_svk/x/fcnn", "beam_svk/x/pod", "beam_svk/y/fcnn", "beam_svk/y/pod"),
-    ]
-    assert "loads=x" in runs["beam_svk/x/fcnn"]
-    assert "trainer.max_epochs=2" in runs["beam_svk/y/fcnn"]
-
-
-def test_an_unknown_group_and_a_path_of_two_runs_are_refused():
-    with pytest.raises(ValueError, match="groups = 'two' must be one of one, losses"):
-        planned(["two"])
-    with pytest.raises(ValueError, match="two runs have the path beam_svk/fcnn"):
-        planned(["one", "one"])
-
-
 @pytest.fixture
 def composed(tmp_path, monkeypatch):
     """Composes and checks the training of a run as its command does; returns the configuration."""
@@ -94,7 +71,7 @@ def composed(tmp_path, monkeypatch):
     monkeypatch.setenv("DPL_CONF", str(CONF))
 
     def composed(run):
-        _, arguments = paper_runs.arguments(run, Path("runs"), State.MISSING)
+        _, arguments = paper.arguments(run, Path("runs"), State.MISSING)
         line = dry_run.arguments_of(arguments, "train", CONF)
         GlobalHydra.instance().clear()
         with dry_run.initialized(line):
@@ -113,7 +90,7 @@ def assert_valid(run, composed):
 
 
 def shipped(scale):
-    return paper_runs.planned(SHIPPED["plan"], None, SHIPPED["scales"][scale]["train"])
+    return paper.planned(SHIPPED["plan"], None, SHIPPED["scales"][scale]["train"])
 
 
 def test_the_last_run_of_each_group_is_a_valid_training(composed):
@@ -135,9 +112,9 @@ def test_every_run_of_the_shipped_plan_is_a_valid_training(scale, composed):
 
 
 def test_the_shipped_plan_has_all_experiments_losses_and_three_seeds():
-    runs = paper_runs.planned(SHIPPED["plan"], SHIPPED["groups"], {})
+    runs = paper.planned(SHIPPED["plan"], SHIPPED["groups"], {})
     folders = {run.path.split("/")[0] for run in runs}
-    assert folders == {*all_results.EXPERIMENTS, "losses"}
+    assert folders == {*EXPERIMENTS, "losses"}
     losses = [run for run in runs if run.path.startswith("losses/")]
     assert len(losses) == 7 * 3
     assert all("model.base=linear" in run.options for run in losses)
@@ -160,43 +137,36 @@ def begin(folder, target="dpl.models.FCNN", **files):
 
 def test_states_follow_from_the_folder_of_a_run(run, tmp_path):
     folder = tmp_path / run.path
-    paper_runs.keep_options(run, tmp_path)
-    assert paper_runs.state(run, tmp_path) == State.MISSING
+    paper.keep_options(run, tmp_path)
+    assert paper.state(run, tmp_path) == State.MISSING
     begin(folder)
-    assert paper_runs.state(run, tmp_path) == State.INTERRUPTED
+    assert paper.state(run, tmp_path) == State.INTERRUPTED
     (folder / "evaluation.json").write_text("[]")
-    assert paper_runs.state(run, tmp_path) == State.FINISHED, "trained by hand"
-    paper_runs.keep_options(run, tmp_path)
-    assert paper_runs.state(run, tmp_path) == State.FINISHED
+    assert paper.state(run, tmp_path) == State.FINISHED, "trained by hand"
+    paper.keep_options(run, tmp_path)
+    assert paper.state(run, tmp_path) == State.FINISHED
     other = Run("one", run.path, ("model=cnn",))
-    assert paper_runs.state(other, tmp_path) == State.OTHER_OPTIONS
+    assert paper.state(other, tmp_path) == State.OTHER_OPTIONS
 
 
 def test_trainings_are_resumed_and_fitted_models_are_evaluated(run, tmp_path):
     folder = tmp_path / run.path
-    script, arguments = paper_runs.arguments(run, tmp_path, State.MISSING)
+    script, arguments = paper.arguments(run, tmp_path, State.MISSING)
     assert (script, arguments) == ("train", ["model=fcnn", f"run={folder}", "ckpt_path=last"])
     begin(folder)
     (folder / "checkpoints/last.ckpt").touch()
-    assert paper_runs.arguments(run, tmp_path, State.INTERRUPTED)[0] == "train"
+    assert paper.arguments(run, tmp_path, State.INTERRUPTED)[0] == "train"
     fitted = Run("one", "beam_svk/unrolled", ("model=unrolled",))
     begin(tmp_path / fitted.path, "dpl.models.Unrolled")
-    assert paper_runs.arguments(fitted, tmp_path, State.INTERRUPTED)[0] == "train"
+    assert paper.arguments(fitted, tmp_path, State.INTERRUPTED)[0] == "train"
     (tmp_path / fitted.path / "checkpoints/last.ckpt").touch()
-    assert paper_runs.arguments(fitted, tmp_path, State.INTERRUPTED) == (
+    assert paper.arguments(fitted, tmp_path, State.INTERRUPTED) == (
         "evaluate",
         [f"run={tmp_path / fitted.path}"],
     )
 
 
 # ------------------------------------------------------------------ processes
-
-
-def test_a_script_returns_its_status(monkeypatch, tmp_path):
-    monkeypatch.setattr(subcommands, "SCRIPTS", tmp_path)
-    (tmp_path / "ends.py").write_text("import sys; sys.exit(int(sys.argv[1]))")
-    assert subcommands.run_script("ends", ["0"]) == 0
-    assert subcommands.run_script("ends", ["7"]) == 7
 
 
 PARENT = """
@@ -206,7 +176,7 @@ from benchmarks import subcommands
 subcommands.SCRIPTS = Path(sys.argv[1])
 try:
     subcommands.run_script("waits", [])
-except subcommands.Interrupted:
+except KeyboardInterrupt:
     print("parent saw it")
     sys.exit(130)
 """
@@ -272,20 +242,10 @@ def test_numbers_of_a_run_are_those_of_its_evaluation(tmp_path):
 # ------------------------------------------------------------------ the commands
 
 
-def test_the_plan_is_printed_and_nothing_is_started(script, tmp_path):
-    ended = script("paper", "only_plan=true", "scale=small", "groups=[full]", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    assert "to do" in ended.out
-    assert "runs/small/beam_nh_loss/fcnn_full_mse" in ended.out
-    assert "plan: 2 runs" in ended.out
-    assert max(map(len, ended.out.splitlines())) <= 100
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_run_of_other_options_is_refused_before_anything_starts(script, tmp_path):
     begin(tmp_path / "runs/small/beam_nh_loss/fcnn_full_mse")
     other = Run("full", "beam_nh_loss/fcnn_full_mse", ("model=cnn",))
-    paper_runs.keep_options(other, tmp_path / "runs/small")
+    paper.keep_options(other, tmp_path / "runs/small")
     ended = script("paper", "scale=small", "groups=[full]", cwd=tmp_path)
     assert ended.status == 2
     assert "runs/small/beam_nh_loss/fcnn_full_mse was trained with other options" in ended.err
@@ -294,7 +254,7 @@ def test_a_run_of_other_options_is_refused_before_anything_starts(script, tmp_pa
 def test_all_results_without_runs_name_what_is_missing(script, tmp_path):
     ended = script("results", "name=all", "folder=out", cwd=tmp_path)
     assert ended.status == 0, ended.err
-    for name in (*all_results.EXPERIMENTS, "losses", "convergence"):
+    for name in (*EXPERIMENTS, "losses", "convergence"):
         assert f"left out: {name}" in ended.out
 
 

@@ -94,6 +94,19 @@ def test_newton_goes_on_from_what_was_predicted(rows):
     assert rows["linear", "twice"].newton_iterations is None
 
 
+def test_an_error_of_one_percent_of_one_load_has_40_db(scene, batch):
+    """With u = 1.01 v, relative L2 is 0.01 and the SNR is 20 log10(101)."""
+    largest = batch.displacement.norm(dim=2).amax(dim=1)
+    k = int(largest.argmax())
+    sets = paper_tables.one_load(batch, 1e3)
+    near = methods.Method(lambda load: 1.01 * batch.displacement[k : k + 1])
+    (row,) = paper_tables.measure({"near": near}, sets, scene.solver, repeats=1)
+    assert (row.method, row.count) == ("near", 1)
+    assert row.rel_L2_median == row.rel_L2_worst == pytest.approx(0.01)
+    assert row.e_max == pytest.approx(0.01 * float(largest[k]))
+    assert pytest.approx(40.0864, abs=1e-3) == row.SNR_min
+
+
 def test_only_what_has_learnt_costs_samples(rows):
     linear, truth = (rows[method, "in range"] for method in ("linear", "truth"))
     assert (linear.samples, linear.generation_minutes, linear.parameters) == (None, None, None)
@@ -143,7 +156,9 @@ def test_rows_of_the_paper_are_marked_as_such():
     assert [(row.method, row.samples) for row in both] == [("paper", 10650), ("paper, 3b", None)]
     (wide,) = paper_tables.paper("beam_young_wide")
     assert (wide.method, wide.e_mean, wide.e_max) == ("paper", 1e-4, None)
-    assert paper_tables.paper("mine") == []
+    assert paper_tables.paper("mine") == paper_tables.paper_single("mine") == []
+    _, single = paper_tables.paper_single("beam_svk")
+    assert single.rel_L2_worst == pytest.approx(0.0098, abs=1e-4), "40.2 dB"
 
 
 def test_rows_of_other_methods_can_be_kept(tmp_path):

@@ -1,9 +1,6 @@
 """Run time against error: every iterate has a time and an error."""
 
-import itertools
-
 import pytest
-import torch
 
 from benchmarks import pareto
 from dpl import Sample
@@ -35,15 +32,6 @@ def rows(solvers, batch):
     return pareto.points(solvers, batch)
 
 
-def test_every_iterate_has_a_row_with_increasing_times(rows, solvers):
-    for name in solvers:
-        path = [row for row in rows if row.solver == name]
-        assert [row.iteration for row in path] == list(range(len(path)))
-        assert [row.is_final for row in path] == [False] * (len(path) - 1) + [True]
-        assert all(a.ms <= b.ms for a, b in itertools.pairwise(path))
-        assert all(row.ms <= row.ms_p99 for row in path)
-
-
 def test_errors_are_those_of_the_iterates(rows):
     by = {(row.solver, row.iteration): row for row in rows}
     assert by["Newton to 1e-08", 0].error == pytest.approx(1.0)
@@ -54,18 +42,3 @@ def test_errors_are_those_of_the_iterates(rows):
     assert ends["near, hybrid"].max_error < 1e-6
     assert ends["near, hybrid"].residual < 1e-8
     assert ends["near, hybrid"].iteration < ends["Newton to 1e-08"].iteration
-
-
-def test_the_number_of_threads_is_set_and_restored(solvers, batch):
-    before = torch.get_num_threads()
-    seen = []
-
-    class Spy:
-        def iterate(self, load):
-            seen.append(torch.get_num_threads())
-            return solvers["near"].iterate(load)
-
-    (row,) = pareto.points({"spy": Spy()}, batch, threads=2)
-    assert set(seen) == {2}
-    assert row.threads == 2
-    assert torch.get_num_threads() == before

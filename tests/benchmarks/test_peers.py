@@ -27,12 +27,6 @@ def test_answer_of_a_case_is_the_one_that_the_codes_agree_on(name):
     assert case.error(problem, answer) < 1e-8
 
 
-def test_median_leaves_the_first_call_out():
-    calls = []
-    assert peers.median(lambda: calls.append(1), 3) >= 0
-    assert len(calls) == 4
-
-
 @pytest.fixture
 def peer(tmp_path):
     """A program that answers with tips, off by so much, and names its shared libraries."""
@@ -88,14 +82,6 @@ def test_a_blas_is_named_after_its_file_and_folder(libraries, reported):
     assert blas_detection.name(libraries) == reported
 
 
-def test_a_folder_with_openblas_as_the_blas_is_found(tmp_path):
-    assert blas_detection.optimised(f"{tmp_path}/*/openblas*/libblas.so.3") is None
-    file = tmp_path / "lib/openblas-pthread/libblas.so.3"
-    file.parent.mkdir(parents=True)
-    file.touch()
-    assert blas_detection.optimised(f"{tmp_path}/*/openblas*/libblas.so.3") == str(file.parent)
-
-
 def test_a_peer_with_the_reference_blas_is_given_openblas_which_its_note_names(peer, monkeypatch):
     monkeypatch.setattr(blas_detection, "optimised", lambda: "/opt/openblas-pthread")
     times = peers.time_reference_code(sys.executable, peer(libraries=[REFERENCE]), 1)
@@ -124,13 +110,6 @@ def test_peer_that_fails_says_why(tmp_path, end):
     program.write_text(f"raise {end}\n")
     with pytest.raises(OSError, match=r"no such library|exit status 3"):
         peers.time_reference_code(sys.executable, program, 1)
-
-
-def test_random_loads_are_counted(scene):
-    (row,) = peers.robustness({"beam": lambda: scene}, 4, 0)
-    assert row.loads == row.in_one_step == row.with_load_steps == 4
-    assert row.iterations >= 1
-    assert 0 < row.min_det_F <= 1
 
 
 @pytest.mark.slow

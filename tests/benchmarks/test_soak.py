@@ -7,9 +7,6 @@ from dataclasses import replace
 import pytest
 
 from benchmarks import soak
-from dpl.inference import Simulator
-from dpl.models import FCNN
-from dpl.training import MSE, Surrogate
 
 EVEN = [soak.Usage("work", 5.0 * k, 100 * k, 500.0, 20, 3, 4) for k in range(50)]
 
@@ -36,11 +33,6 @@ def test_growth_and_loss_of_speed_are_reported(change, message):
     assert any(message in line for line in found), found
 
 
-def test_too_few_records_raise_an_error():
-    with pytest.raises(ValueError, match="increase minutes"):
-        soak.regressions(EVEN[:9])
-
-
 def test_processes_files_and_memory_of_children_count():
     before = soak.usage("before", 0.0, 0)
     holding = "x = bytearray(200_000_000); f = open('/dev/null'); print(flush=True); input()"
@@ -55,14 +47,6 @@ def test_processes_files_and_memory_of_children_count():
     assert during.files > before.files + 3
     assert soak.leftovers(before, during) == ["1 processes more than before"]
     assert soak.leftovers(before, after) == []
-
-
-def test_every_kind_of_call_is_made(scene):
-    sim = Simulator(Surrogate(FCNN(scene, width=8), MSE(), scene))
-    rows = list(soak.simulator(sim, 1.5, every=0.05))
-    assert rows[-1].steps > 7, "every kind of call was made"
-    assert [row.seconds for row in rows] == sorted(row.seconds for row in rows)
-    assert soak.summary(rows).startswith("simulator: ")
 
 
 @pytest.mark.slow

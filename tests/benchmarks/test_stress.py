@@ -52,11 +52,6 @@ def test_cases_cover_all_identifiers():
     assert stress.names(select_cases()) == [*(f"T{k}" for k in range(1, 24)), "sweep"]
 
 
-def test_a_case_that_does_not_exist_is_an_error():
-    with pytest.raises(ValueError, match="'T99' is none of T1, T2"):
-        select_cases(["T99"])
-
-
 def test_a_number_that_misses_its_reference_is_silently_wrong(monkeypatch):
     """The references are compared: another one makes the case silently wrong."""
     monkeypatch.setitem(stress.networks.REFERENCE_CORNER, 1e-2, ".900")
@@ -72,20 +67,6 @@ def test_a_number_that_misses_its_reference_is_silently_wrong(monkeypatch):
 def table(path):
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-def test_two_cases_from_the_command_line(script, tmp_path):
-    ended = script("stress", "cases=[T12,T21]", cwd=tmp_path)
-    assert ended.status == 0, ended.err
-    assert "expected: an error with the numbers of the cells" in ended.out
-    assert "observed: ValueError: 4 cells are inverted: 2, 3, 6, 7" in ended.out
-    assert "2 cases in" in ended.out
-    rows = table(tmp_path / "runs/stress/cases.csv")
-    assert [row["case"] for row in rows] == ["T12", "T21"]
-    assert {row["verdict"] for row in rows} == {"as expected"}
-    comparisons = table(tmp_path / "runs/stress/numbers.csv")
-    assert ".818" in {row["reference"] for row in comparisons}
-    assert all(row["holds"] == "True" for row in comparisons)
 
 
 @pytest.mark.parametrize(

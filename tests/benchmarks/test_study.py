@@ -6,12 +6,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 
-from benchmarks import all_results, deflections
-from benchmarks.commands import CONF
-from benchmarks.study import WIDTH, dots, picture, place_labels, read
+from benchmarks import CONF, deflections, results
+from benchmarks.study import WIDTH, dots, picture, read
 from dpl.evaluation.tables import write
 from dpl.visualization import DPI
 
@@ -44,7 +42,7 @@ def test_rows_are_read_as_they_were_written(tmp_path):
 
 
 def test_every_published_figure_belongs_to_rows_of_its_name():
-    columns = [[field.name for field in fields(kind)] for kind, _ in all_results.figures()]
+    columns = [[field.name for field in fields(kind)] for kind, _ in results.figures()]
     assert all(a != b for a, b in itertools.combinations(columns, 2)), "columns tell the class"
     drawable = set()
     for path in RESULTS.glob("*.csv"):
@@ -72,23 +70,3 @@ def test_a_row_of_dots_has_those_whose_values_are_known(tmp_path):
         dots(ax, ["a", "b"], [0.1, None], [1.0, 0.5], ["0.1", "0.5"])
     places = [line.get_xydata().tolist() for line in ax.lines if line.get_marker() == "o"]
     assert places == [[[0.1, 0.0]], [[1.0, 0.0]], [[0.5, 1.0]]]
-
-
-def test_labels_stand_next_to_their_points_and_cover_no_line_and_no_label():
-    figure = Figure(figsize=(5, 4))
-    ax = figure.add_subplot()
-    ax.plot([0, 1, 2], [0, 0.1, 2], "o-")
-    ax.plot([0, 2], [0.3, 0.3], "s-")
-    points = [(0, 0), (1, 0.1), (2, 2), (1, 0.3)]
-    texts = [
-        ax.annotate("a label", at, (0, 0), textcoords="offset points", ha="center", va="center")
-        for at in points
-    ]
-    place_labels(ax, texts)
-    figure.draw_without_rendering()
-    boxes = [text.get_window_extent() for text in texts]
-    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
-    lines = [line.get_path().transformed(ax.transData) for line in ax.lines]
-    assert not any(line.intersects_bbox(box, filled=False) for line in lines for box in boxes)
-    for box, at in zip(boxes, ax.transData.transform(points), strict=True):
-        assert np.abs(at - (box.p0 + box.p1) / 2).max() < 1.2 * box.width

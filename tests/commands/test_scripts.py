@@ -314,26 +314,6 @@ def test_the_hparams_tab_shows_the_runs_of_a_sweep_side_by_side(swept):
         assert ("model.layers" in line.hparams) == (shown["model"] == "FCNN")
 
 
-@pytest.mark.slow
-def test_every_network_trains_with_either_loss_in_one_command(start, tiny_training, tmp_path):
-    """As it stands in the README, but for the size; networks have the widths of their files."""
-    sizes = [o for o in tiny_training if not o.startswith("model.")]
-    process = start(
-        "train", "-m", "model=fcnn,cnn,gnn,pod", "loss=mse,lr_star", *sizes,
-        "trainer.max_epochs=1", "run=all", cwd=tmp_path,
-    )  # fmt: skip
-    status, _, err = finish(process)
-    assert status == 0, err[-2000:]
-    runs = configurations(tmp_path / "all")
-    models = ("FCNN", "CNN", "GNN", "PODNet")
-    assert set(runs) == {(model, loss, "AdamW") for model in models for loss in ("MSE", "LrStar")}
-    for folder in runs.values():
-        rows = json.loads((folder / "evaluation.json").read_text())
-        assert np.isfinite(rows[1]["errors"]["e_mean"])
-        assert (folder / "checkpoints/best.safetensors").exists()
-    assert len(list((tmp_path / "datasets").iterdir())) == 1
-
-
 @pytest.fixture
 def search(script, tiny_training, tmp_path):
     """Searches for numbers of a POD network on the tiny scene; returns result and folder."""

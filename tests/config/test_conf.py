@@ -200,14 +200,6 @@ def test_commands_share_the_sizes_of_the_data_set(compose):
         assert one.data[key] == other.data[key], key
 
 
-def test_the_default_is_the_main_job(compose):
-    cfg = compose("folder=.", command="train")
-    assert cfg.mesh.nodes == [40, 10, 10]
-    assert cfg.material._target_.endswith("NeoHookeanLn")
-    assert cfg.model._target_.endswith("Unrolled")
-    assert (cfg.data.train, cfg.data.test) == (256, 50)
-
-
 @pytest.mark.parametrize("name", options("debug"))
 def test_a_debug_option_composes_and_passes_the_check(compose, name):
     cfg = compose(f"debug={name}", "folder=.", command="train")
@@ -245,13 +237,6 @@ def test_a_logger_whose_package_is_missing_names_its_installation(compose, name)
     cfg = compose("folder=.", f"logger={name}", "trainer.accelerator=cpu", command="train")
     with pytest.raises(ConfigError, match=rf"logger\.{name}: .*pip install -U '{name}"):
         build.build_trainer(cfg)
-
-
-def test_a_model_brings_the_batch_size_and_the_epochs_that_suit_it(compose):
-    usual, cfg = (compose(f"model={name}", "folder=.", command="train") for name in ("fcnn", "cnn"))
-    assert (usual.data.batch_size, cfg.data.batch_size) == (256, 16)
-    assert cfg.model._target_.endswith("CNN")
-    assert cfg.optimizer == usual.optimizer
 
 
 def test_the_command_line_wins_over_an_experiment(compose):
@@ -297,13 +282,6 @@ def test_small_loads_are_small_in_force_and_in_area(scene_of):
     assert int((drawn.force.any(dim=2).sum(dim=1) == 1).sum()) > 20
     for number in range(3):
         assert solve_load(scene, LoadKey((0, 0), number)).accepted
-
-
-def test_options_of_the_loads_can_be_changed_one_by_one(scene_of):
-    usual = scene_of(*SMALL["beam"])
-    changes = ["eigenvalue_exponent=1", "sampling=sobol", "radius._target_=dpl.fem.loads.constant"]
-    for change in [*changes, "distribution._target_=dpl.fem.loads.normal"]:
-        assert scene_of(*SMALL["beam"], f"loads.{change}").fingerprint != usual.fingerprint
 
 
 def test_the_beam_of_a_range_of_moduli_shares_its_data_with_the_beam_of_one(scene_of):

@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
-from benchmarks.commands import (
+from benchmarks import (
     benchmark,
     convergence,
     pareto,
@@ -27,6 +27,7 @@ from benchmarks.commands import (
     stress,
     verify,
 )
+from benchmarks.methods import load_runs
 from dpl.commands import cli
 from dpl.config import ConfigError, build, plain, resume, run_folder, validation
 from dpl.training import checkpoints
@@ -42,22 +43,15 @@ BAD = {  # override -> what the message must name
     "solver._partial_=false": r"solver: .*missing .*'problem'; set _partial_: true if the caller",
     "young=-1": r"young = -1",
     "young=1e308": r"young = 1e\+308 must lie between 1e-30 and 1e\+30",
-    "young=1e400": r"young = inf",
-    "young=abc": r"young = 'abc'",
     "young=[2e9,1e9]": r"young = \[2000000000\.0, 1000000000\.0\]",
-    "young=[1e9]": r"young = ",
-    "young={low:1e6}": r"young = \{'low': 1000000.0\} must be",
     "young={low:1e6,hihg:1e9}": r"young\.hihg: there is no such key; did you mean young\.high\?",
     "young={low:1e9,high:1e6}": r"young = .* an ascending range",
     "young={low:0,high:1e6}": r"young\.low = 0 must lie between",
-    "young={low:abc,high:1e6}": r"young\.low = 'abc' must be a number",
     "young={low:1,high:2,distribution:normal}": r"young\.distribution = 'normal' must be one of",
     "young={low:1,high:2,_target_:os.system}": r"young = .*, not a call$",
-    "young=true": r"young = True",
     "mesh.nodes=[5,3]": r"mesh: nodes = \[5, 3\]",
     "mesh.nodes=[5,3,2.5]": r"mesh\.nodes = \[5, 3, 2\.5\] must be a list, each a whole number",
     "mesh.size=[1,1,nan]": r"mesh\.size\.2 = nan",
-    "mesh.size=1": r"mesh\.size = 1 must be a list, each a number",
     "+mesh.cell=pyramid": r"mesh: cell = 'pyramid'",
     "mesh=file": r"mesh\.path",
     "mesh=file mesh.path=nowhere.msh": r"mesh: nowhere\.msh: no such mesh file",
@@ -66,7 +60,6 @@ BAD = {  # override -> what the message must name
     "loads=traction loads.region=7": r"loads.region = 7 must be a call or .* or a text or null$",
     "fixed.axis=3": r"fixed: axis = 3",
     "fixed.at=middle": r"fixed: at = 'middle'",
-    "mesh=rectangle fixed.axis=2": r"fixed.*axis = 2 must be less than 2",
     "fixed.at=null": r"fixed\.at = None must be a number or a text",
     "degree=3": r"degree",
     "solver.tol=0": r"solver: tol = 0",
@@ -75,24 +68,18 @@ BAD = {  # override -> what the message must name
     "loads.n_modes=0": r"loads: n_modes = 0",
     "loads.n_modes=1000": r"n_modes = 1000",
     "loads.modes=[3,0]": r"loads: modes = \[3, 0\] must be ascending",
-    "loads.modes=[]": r"loads: modes = \[\] must be ascending",
-    "loads.modes=[-1]": r"loads: modes = \[-1\] must be ascending",
     "loads.modes=[1000]": r"loads: modes = \[1000\] must lie between 0 and",
     "loads.deflection=-0.1": r"loads: deflection = -0\.1",
     "loads.patch_radius=[0.5,0.1]": r"loads: patch_radius = \[0\.5, 0\.1\]",
-    "loads.patch_radius=[0.5]": r"loads: patch_radius = \[0\.5\]",
     "loads.distribution._target_=dpl.fem.materials.tensors.hooke": r"loads\.distribution\._target_",
     "loads.deflection=1e-300": r"loads: deflection = 1e-300",
     "loads.n_modes=1000000000000000000000": r"loads\.n_modes = 10+ does not fit into 64 bits",
     "loads.distribution=uniform": r"loads\.distribution = 'uniform' must be",
     "~mesh": r"mesh is missing",
-    "~forces": r"forces is missing",
     "~mesh._target_": r"mesh = .* must be a call: its _target_ is missing",
-    "fixed.at={}": r"fixed\.at = \{\} must be a number or a text",
     "+forces.weight=3": r"forces\.weight = 3 must be a call",
     "material._target_=os": r"material\._target_ = 'os' does not exist",
     "material._target_=os.path": r"material\._target_ = 'os\.path' cannot be called",
-    "material._target_=3": r"material\._target_ = 3 must be a text",
     "+mesh._args_=[1]": r"mesh\._args_: .* has no such option",
     "solver._partial_=yes_please": r"solver\._partial_ = 'yes_please' must be true or false",
     "material.poisson={_target_:dpl.fem.CellField,values:[0.1]}": (
@@ -129,7 +116,6 @@ BAD_TRAINING = {
     "data.train=0": r"data\.train = 0 must lie between 1 and",
     "+data.vall=3": r"data\.vall: .* has no such option",
     "model.layers=1": r"model: layers = 1",
-    "model.width=0": r"model: width = 0",
     "model.width=wide": r"model\.width = 'wide' must be a whole number or null",
     "+model.memory_limit=1e-6": r"model: .* parameters .* need .* GB, there are 0\.0 GB",
     "loss=lr_plus loss.weight=-1": r"loss: weight = -1",
@@ -140,13 +126,10 @@ BAD_TRAINING = {
     "+callbacks.mine=3": r"callbacks\.mine = 3 must be a call",
     "seed=abc": r"(seed|shuffle_seed) = 'abc'",
     "data=online data.train.new_per_round=0": r"data: new_per_round = 0",
-    "data=online data.val=0": r"data: val = 0",
     "data=online data.train.capacity=2": r"data: capacity = 2 must be at least new_per_round = 8",
     "data.timeout=0": r"data: timeout = 0",
-    "data.folder=3": r"data\.folder = 3 must be",
     "data=online data.train.capacity=1000000000000": r"data: 10+ samples need .* GB, there",
     "data.batch_size=10000000000": r"data: batch_size = 10+ must lie between 1 and",
-    "data.shuffle_seed=-1": r"data: shuffle_seed = -1",
     "seed=4294967296": r"seed = 4294967296 must lie between 0 and 4294967295",
     "~scheduler": r"scheduler is missing",
     "optimizer.betas=[0.9]": r"optimizer\.betas = \[0\.9\] must be",
@@ -156,13 +139,9 @@ BAD_TRAINING = {
     "data.workers=1000000000": r"data: workers = 10+ must lie between 0 and 1,024",
     "callbacks.worst_cases=text": r"callbacks\.worst_cases = 'text' must be a call",
     "trainer.max_epochs=-5": r"trainer\.max_epochs = -5 must lie between 1 and \d+ or be -1",
-    "trainer.max_epochs=0": r"trainer\.max_epochs = 0 must lie",
-    "+trainer.max_steps=0": r"trainer\.max_steps = 0 must lie",
     "+trainer.limit_train_batches=0": r"trainer\.limit_train_batches = 0 must lie",
-    "trainer.check_val_every_n_epoch=0": r"trainer\.check_val_every_n_epoch = 0 must lie",
     "trainer.log_every_n_steps=-1": r"trainer\.log_every_n_steps = -1 must lie",
     "trainer.max_time=two": r"^trainer\.max_time = two must be HH:MM:SS",
-    "trainer.max_time=00:00:00": r"^trainer\.max_time = 00:00:00 must be",
     "trainer.max_time={minute:2}": r"^trainer\.max_time = \{'minute': 2\} must be",
     "optimizer.lr=0": r"optimizer\.lr = 0 must lie between 1e-30 and 1000000",
     "+trainer.enable_progress_bar=false": r"^trainer: .*enable_progress_bar=False.* found .*Bar",
@@ -174,18 +153,12 @@ if not torch.cuda.is_available():
 
 BAD_COMMANDS = {
     "evaluate run=x tols=[small]": r"tols = \['small'\] must be a list, each a number",
-    "evaluate run=x tols=[0]": r"tols = \[0\] must lie between 1e-15 and 1",
     "convergence twice=perhaps": r"twice = 'perhaps' must be true or false",
     "evaluate run=x tols=[1.0]": r"tols = \[1\.0\] must lie between 1e-15 and 1, 1 excluded",
-    "convergence tols=[1e-3,2]": r"tols = \[0\.001, 2\] must lie between",
     "pareto run=x threads=[]": r"threads = \[\] must name one value or more",
     "results name=x count=many": r"count = 'many' must be a whole number",
-    "results name=x galerkin=text": r"galerkin = 'text' must be",
     "benchmark repeats=0": r"repeats = 0 must lie between 1 and",
-    "benchmark samples=1000000000000": r"samples = 10+ must lie between 1 and",
     "benchmark reference_codes=text": r"reference_codes = 'text' must be",
-    "stress cases=T2": r"cases = 'T2' must be a list, each a text or null",
-    "convergence max_plain_iterations=0": r"max_plain_iterations = 0 must lie between 1 and",
     "soak folder=. minutes=0": r"minutes = 0 must lie between 0\.01 and",
     "view run=x trust={_target_:builtins.dict}": r"trust = .* must be true or false",
     "verify cases=3": r"cases = 3 must be a list, each a text",
@@ -450,7 +423,7 @@ def test_runs_of_other_moduli_or_sizes_come_back_as_they_were(several):
     home, kept = several
     loads = kept["b"].scene.loads.sample((0, 2), range(4))
     force, young = loads.force * 1e9, loads.young
-    found = run_folder.load_runs(home)
+    found = load_runs(home)
     for name, (_, again) in found.items():
         with torch.no_grad():
             assert torch.equal(again(force, young), kept[name](force, young)), name
@@ -468,7 +441,7 @@ def test_runs_of_other_scenes_are_refused(several, tiny_training, tmp_path):
     shutil.copytree(several[0] / "a", tmp_path / "a")
     _trained(tmp_path / "b", *tiny_training, *WIDE, "material.poisson=0.25")
     with pytest.raises(ConfigError, match=r"b is of another scene than a: law\.poisson"):
-        run_folder.load_runs(tmp_path)
+        load_runs(tmp_path)
 
 
 def test_a_run_keeps_its_resolved_configuration(trained):

@@ -27,7 +27,7 @@ def trained(trained_run, home):
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")
 def test_export_writes_the_documented_folder(script, trained):
-    ended = script("export", "run=runs/first", "samples=4", "repeats=2", "count=2", cwd=trained)
+    ended = script("export", "run=runs/first", "samples=4", "count=2", cwd=trained)
     assert ended.status == 0, ended.err[-2000:]
     folder = trained / "runs/first/export"
     names = {path.name for path in folder.iterdir()}
@@ -38,12 +38,6 @@ def test_export_writes_the_documented_folder(script, trained):
     report = json.loads((folder / "report.json").read_text(), parse_constant=pytest.fail)
     assert report["passed"]
     assert report["largest_error"] <= report["tolerance"] == 1e-4
-    assert [row["batch"] for row in report["milliseconds"]] == [1, 4]
-    for row in report["milliseconds"]:
-        for engine in ("torch", "onnxruntime"):
-            assert 0 < row[f"{engine}_p50"] <= row[f"{engine}_p99"]
-    assert list(report["latency"]) == ["sim(force)", "bare network"]
-    assert "latency, 1 thread: sim(force) p50 " in ended.out
     meta = json.loads((folder / "meta.json").read_text(), parse_constant=pytest.fail)
     judged = json.loads((trained / "runs/first/evaluation.json").read_text())
     assert meta["errors"] == judged[1]["errors"]
@@ -62,7 +56,7 @@ def test_export_writes_the_documented_folder(script, trained):
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")
 def test_a_graph_with_too_large_a_difference_is_removed(script, trained):
-    requested = ["run=runs/first", "folder=off", "outputs=[model]", "samples=4", "repeats=1"]
+    requested = ["run=runs/first", "folder=off", "outputs=[model]", "samples=4"]
     ended = script("export", *requested, "tol=1e-12", cwd=trained)
     assert ended.status == 1
     (line,) = ended.err.strip().splitlines()
@@ -112,6 +106,6 @@ def test_without_onnx_the_message_names_the_extra(script, trained, monkeypatch):
 def test_an_invalid_evaluation_file_is_reported(script, trained):
     shutil.copytree(trained / "runs/first", trained / "runs/broken")
     (trained / "runs/broken/evaluation.json").write_text("[{}]")
-    ended = script("export", "run=runs/broken", "samples=1", "repeats=1", cwd=trained)
+    ended = script("export", "run=runs/broken", "samples=1", cwd=trained)
     assert ended.status == 2
     assert "is not an evaluation" in ended.err

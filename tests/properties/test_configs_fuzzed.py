@@ -210,7 +210,7 @@ def refused(cfg: dict, folder: Path, keys=()) -> str:
 def own_keys(name: str):
     """Return the keys of a command besides those of all commands; see `dpl.config.check`."""
     command = name.partition(" ")[0]
-    for package in ("dpl.commands", "benchmarks.commands"):
+    for package in ("dpl.commands", "benchmarks"):
         with suppress(ImportError):
             return getattr(importlib.import_module(f"{package}.{command}"), "KEYS", ())
     return ()

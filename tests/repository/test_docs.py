@@ -133,7 +133,7 @@ def test_every_result_is_listed_with_the_command_that_makes_it():
     """In CONTRIBUTING.md, where patterns as `beam_*` stand for several files."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split("\n## Measurements\n")[1]
     rows = re.findall(r"^\| `(\w+)`(?: .*?)?\|(.*)\|$", text, re.M)
-    own = {path.stem for path in (ROOT / "benchmarks/commands").glob("[a-z]*.py")}
+    own = {path.stem for path in (ROOT / "benchmarks/conf").glob("*.yaml")}
     assert {name for name, _ in rows} == own
     patterns = [found for _, row in rows for found in re.findall(r"`([\w*]+)`", row)]
     for path in RESULTS.iterdir():

@@ -1,15 +1,30 @@
-"""Runs that the tables of the paper need: their plan and their states.
+"""Train all runs of the paper's tables and write the tables: python scripts/paper.py.
 
-The plan is data, `benchmarks/conf/paper.yaml`. The folder of a run keeps the options of its plan.
+Prints the plan and trains the runs that are missing, one after the other. Finished runs are
+skipped, interrupted ones resumed, data sets shared. The same command continues after Ctrl-C or a
+failure. The plan is data, `benchmarks/conf/paper.yaml`; the folder of a run keeps the options of
+its plan.
 """
 
 import itertools
 import json
+import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
+
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+
+from benchmarks import CONF
+from benchmarks.subcommands import run_script
+from dpl import config
+from dpl.commands.cli import command
+from dpl.config.run_folder import checked_config
+from dpl.system.threads import available_cores
 
 OPTIONS = "paper.json"  # file in the folder of a run
 FULL = "full"  # name of the scale whose runs lie in the folder itself
@@ -117,10 +132,6 @@ def keep_options(run: Run, root: Path) -> None:
 
 def fits_in_one_step(folder: Path) -> bool:
     """Return True if the model of a run is fitted, so that its training cannot be resumed."""
-    from hydra.utils import get_object
-
-    from dpl.config.run_folder import checked_config
-
     model = checked_config(folder / "config.yaml").get("model", {})
     return callable(getattr(get_object(model.get("_target_", "builtins.object")), "fit", None))
 
@@ -136,3 +147,87 @@ def arguments(run: Run, root: Path, present: State) -> tuple[str, list[str]]:
     if present == State.INTERRUPTED and fitted and fits_in_one_step(folder):
         return "evaluate", [f"run={folder}"]
     return "train", [*run.options, f"run={folder}", "ckpt_path=last"]
+
+
+KEYS = (
+    (str, "runs scale"),
+    (Sequence[str] | None, "groups"),
+    (Sequence[str], "options"),
+    (dict, "plan scales"),
+    (bool, "only_plan tables"),
+)
+WIDTH = 100  # of printed lines
+
+
+@command("paper", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Train the runs that are missing; write tables and figures."""
+    if cfg.scale not in cfg.scales:
+        raise config.ConfigError(f"scale = {cfg.scale} must be one of {', '.join(cfg.scales)}")
+    full = cfg.scale == FULL
+    root = Path(cfg.runs) if full else Path(cfg.runs) / cfg.scale
+    folder = Path(cfg.folder) if full else root / "results"
+    scale = OmegaConf.to_container(cfg.scales[cfg.scale])
+    assert isinstance(scale, dict)
+    with config.error_in("plan", ValueError):
+        runs = planned(
+            OmegaConf.to_container(cfg.plan),
+            cfg.groups,
+            scale["train"],
+            list(cfg.options),
+        )
+    states = _plan(runs, root, available_cores())
+    if cfg.only_plan:
+        return
+    failed = _train(runs, states, root)
+    if cfg.tables:
+        failed += _write_tables(root, folder, scale)
+    if failed:
+        print(f"failed: {', '.join(failed)}; run the same command again", file=sys.stderr)
+        sys.exit(1)
+
+
+def _plan(runs: Sequence[Run], root: Path, cores: int) -> list[State]:
+    """Print the plan with the states of the runs, and return the states."""
+    states = [state(run, root) for run in runs]
+    for run, present in zip(runs, states, strict=True):
+        line = f"{present:14} {root / run.path}: {' '.join(run.options)}"
+        print(line if len(line) <= WIDTH else f"{line[: WIDTH - 4]} ...")
+    counts = [f"{states.count(one)} {one}" for one in State if one in states]
+    print(f"plan: {len(runs)} runs on {cores} cores, {', '.join(counts)}", flush=True)
+    if State.OTHER_OPTIONS in states:
+        path = root / runs[states.index(State.OTHER_OPTIONS)].path
+        raise config.ConfigError(
+            f"runs: {path} was trained with other options; remove it or choose another folder"
+        )
+    return states
+
+
+def _train(runs: Sequence[Run], states: Sequence[State], root: Path) -> list[str]:
+    """Finish the runs and return the paths of those that failed."""
+    failed = []
+    pairs = zip(runs, states, strict=True)
+    missing = [pair for pair in pairs if pair[1] != State.FINISHED]
+    begin = time.perf_counter()
+    for number, (run, present) in enumerate(missing, 1):
+        script, line = arguments(run, root, present)
+        print(f"\n[{number}/{len(missing)}] {script} {' '.join(line)}", flush=True)
+        try:
+            status = run_script(script, line)
+        finally:
+            keep_options(run, root)
+        if status:
+            failed.append(run.path)
+        minutes = (time.perf_counter() - begin) / 60
+        left = f"{len(missing) - number} runs left, {minutes:.1f} min so far"
+        print(f"{run.path}: {left}", flush=True)
+    return failed
+
+
+def _write_tables(root: Path, folder: Path, scale: dict[str, list[str]]) -> list[str]:
+    """Write tables and figures of all experiments; return the name of the script if it failed."""
+    inner = ",".join(f"'{option}'" for option in scale["convergence"])
+    arguments = ["name=all", f"runs={root}", f"folder={folder}", f"convergence=[{inner}]"]
+    print(f"\n[tables] results {' '.join(arguments)}", flush=True)
+    status = run_script("results", [*arguments, *scale["results"]])
+    return ["tables"] if status else []

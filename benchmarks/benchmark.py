@@ -1,20 +1,27 @@
-"""Cases of the comparison of the mechanics with public codes, see `benchmarks.commands.benchmark`.
+"""Measure run times of the mechanics and of public codes: python scripts/benchmark.py.
 
-Each case is a function of the configuration that records the rows of one study or several.
+Long cases on demand: cases=[large] (run alone, it reports its memory), cases=[robustness],
+cases=[generation], cases=[sizes]; errors of other meshes: cases=[discretisation]; displacements of
+the test loads: cases=[deflections] count=100; latency of a trained run:
+cases=[latency] run=runs/mine; loads on small areas: cases=[local] run=runs/mine count=250.
 """
 
 import statistics
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from omegaconf import DictConfig
 
+from benchmarks import CONF, peers
+from benchmarks import deflections as reached
+from benchmarks import discretisation as meshes
 from benchmarks import generation as ways
-from benchmarks import peers
+from benchmarks import sizes as beams
 from benchmarks.study import record
 from dpl import Scene, config
+from dpl.commands.cli import command
 from dpl.evaluation.tables import machine
 from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed_backends
 from dpl.fem.linear import BACKENDS
@@ -27,8 +34,21 @@ CASES = (
 )
 
 
-def run(cfg: DictConfig) -> None:
-    """Measure the chosen cases; print tables and write rows to `folder`."""
+KEYS = (
+    (Sequence[str], "linear"),
+    (Sequence[str] | None, "cases bodies"),
+    (dict, "reference_codes"),
+    (int, "workers", 0, 1024),
+    (Sequence[int], "cells_across", 1, 1000),
+)
+
+
+@command("benchmark", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Time the chosen cases, print tables and write the rows to a folder.
+
+    Each case is a function of the configuration that records the rows of one study or several.
+    """
     cases = CASES if cfg.cases is None else cfg.cases
     if unknown := [case for case in cases if case not in CASES]:
         raise config.ConfigError(f"cases = {unknown[0]!r} must be one of {', '.join(CASES)}")
@@ -123,8 +143,6 @@ def generation(cfg: DictConfig) -> None:
 
 def discretisation(cfg: DictConfig) -> None:
     """Record the errors of coarser, finer and quadratic meshes of the beam and of the propeller."""
-    from benchmarks import discretisation as meshes
-
     for name, law in (("beam_svk", SaintVenantKirchhoff(0.3)), ("propeller_nh", NeoHookeanLn(0.3))):
         family = meshes.FAMILIES[name.partition("_")[0]]
         rows = meshes.discretisations(family, law, repeats=cfg.repeats)
@@ -133,8 +151,6 @@ def discretisation(cfg: DictConfig) -> None:
 
 def sizes(cfg: DictConfig) -> None:
     """Record the costs of solvers and networks on beams of growing size."""
-    from benchmarks import sizes as beams
-
     parts = beams.sizes(cfg.cells_across, loads=cfg.repeats)
     rows = (row for part in parts for row in part)
     record(rows, Path(cfg.folder) / "sizes", "beams of growing size", beams.draw)
@@ -142,15 +158,13 @@ def sizes(cfg: DictConfig) -> None:
 
 def deflections(cfg: DictConfig) -> None:
     """Record the deflections of the paper's beam and propeller under test loads."""
-    from benchmarks import deflections as sizes
-
     scenes = {
         "beam_svk": peers.beam_scene(SaintVenantKirchhoff(0.3)),
         "propeller_nh": peers.propeller_scene(),
     }
-    rows = sizes.deflections(scenes, cfg.count, cfg.workers)
-    rows = record(rows, Path(cfg.folder) / "deflections", None, sizes.draw)
-    for name, values in sizes.by_body(rows).items():
+    rows = reached.deflections(scenes, cfg.count, cfg.workers)
+    rows = record(rows, Path(cfg.folder) / "deflections", None, reached.draw)
+    for name, values in reached.by_body(rows).items():
         least, middle, most = min(values), statistics.median(values), max(values)
         print(
             f"{name}: largest nodal displacements of {len(values)} loads {least:.2g} to "
@@ -160,25 +174,24 @@ def deflections(cfg: DictConfig) -> None:
 
 def latency(cfg: DictConfig) -> None:
     """Record the wall times of a trained run."""
-    from benchmarks import run_latency
+    from benchmarks.latency import call_times
 
     simulator = Simulator(config.load_run(_run(cfg, "latency"))[1])
     load = simulator.scene.loads.sample((0, 2), range(cfg.samples))
-    calls = run_latency.call_times(simulator, load, repeats=cfg.repeats)
+    calls = call_times(simulator, load, repeats=cfg.repeats)
     record(calls, Path(cfg.folder) / "latency", "one load, one thread [ms]")
 
 
 def local(cfg: DictConfig) -> None:
-    """Record errors and latencies of a trained run of `unrolled` for loads on small areas."""
+    """Record the errors of a trained run of `unrolled` for loads on small areas."""
     from benchmarks import local_loads
     from dpl.models import Unrolled
 
     surrogate = config.load_run(_run(cfg, "local"))[1]
     if not isinstance(surrogate.net, Unrolled):
         raise config.ConfigError(f"run = {cfg.run} must be a run of model=unrolled")
-    rows = local_loads.measure(surrogate, cfg.count, repeats=cfg.repeats)
     stem = Path(cfg.folder) / f"local_loads_{Path(cfg.run).name}"
-    record(rows, stem, "loads on small areas, one thread [ms]")
+    record(local_loads.measure(surrogate, cfg.count), stem, "errors for loads on small areas")
 
 
 def _run(cfg: DictConfig, case: str) -> str:

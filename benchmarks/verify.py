@@ -10,9 +10,10 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from benchmarks.commands import CONF
+from benchmarks import CONF, verification
 from dpl import config
 from dpl.commands.cli import command
+from dpl.system.threads import one_thread
 
 KEYS = ((Sequence[str] | None, "cases"),)
 
@@ -20,9 +21,6 @@ KEYS = ((Sequence[str] | None, "cases"),)
 @command("verify", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Solve the chosen cases and write the page of all cases."""
-    from benchmarks import verification
-    from dpl.system.threads import one_thread
-
     few = [name for name in verification.CASES if name not in verification.LONG]
     cases = few if cfg.cases is None else cfg.cases
     if unknown := [name for name in cases if name not in verification.CASES]:

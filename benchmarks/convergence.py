@@ -1,4 +1,4 @@
-"""Convergence of Newton started from rest and from predictions.
+"""Newton from zero and from predictions: python scripts/convergence.py run=runs/beam_svk.
 
 Extends experiment 4 of Odot, Haferssas, Cotin (2022), DeepPhysics.
 """
@@ -7,13 +7,20 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import DictConfig
+from rich.progress import Progress
 
+from benchmarks import CONF
+from benchmarks.methods import load_runs
 from benchmarks.plain_newton import PlainNewton
-from benchmarks.study import dots, dots_legend, method_colours, picture
+from benchmarks.study import dots, dots_legend, method_colours, picture, record
+from dpl import config
+from dpl.commands.cli import command
 from dpl.evaluation.timing import time_interleaved
 from dpl.fem import AndersonSolver, Load, Solver
 from dpl.inference import Hybrid
@@ -233,3 +240,31 @@ def draw(rows: Sequence[Summary], path: Path) -> None:
         iterations.set(xlabel="iterations", xlim=(0, None))
         time.set(xlabel="time / robust Newton", xlim=(0, None))
         dots_legend(figure, "mean", "most")
+
+
+KEYS = (
+    (bool, "twice"),
+    (Sequence[str] | None, "solvers"),
+    (int | None, "max_plain_iterations", 1, 10**6),
+)
+
+
+@command("convergence", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Measure all solvers on all loads; write rows, machine and figure."""
+    runs = load_runs(cfg.run, cfg.networks, trust=cfg.trust)
+    scene = next(iter(runs.values()))[1].scene
+    networks = {name: surrogate.predict for name, (_, surrogate) in runs.items()}
+    sets = load_sets(scene, cfg.count, twice=cfg.twice)
+    trials: list[Trial] = []
+    with Progress() as progress:
+        bar = progress.add_task("loads", total=len(cfg.tols) * len(sets) * cfg.count)
+        for tol in cfg.tols:
+            with config.error_in("solvers", ValueError):
+                solvers = solvers_of(scene, networks, tol, names=cfg.solvers)
+            for name, load in sets.items():
+                trials += measure(solvers, name, load, tol, partial(progress.advance, bar))
+    limit = cfg.max_plain_iterations
+    within = [] if limit is None else limited(trials, limit)
+    rows = PAPER + summary([*trials, *within])
+    record(rows, Path(cfg.folder) / cfg.name, f"{cfg.name}, one load at a time, 1 thread", draw)
