@@ -295,7 +295,7 @@ def networks(scene: Scene) -> dict[str, Callable[[], Any]]:
 def rivals(
     scene: Scene, train: Sample, held: Sample, names: Sequence[str] | None, seconds: float
 ) -> Iterator[tuple[str, str, Predictor, float, int]]:
-    """Yield name, base, predictor, processor time of the fit [s] and number of weights of each method."""
+    """Yield name, base, predictor, processor time of the fit [s] and weights of each method."""
     for name, build in networks(scene).items():
         for base, kind in BASES.items():
             if names is not None and not any(one in name for one in names):
@@ -366,6 +366,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     """Draw error against time of a prediction, and against the number of loads."""
     from benchmarks.study import method_colours
 
+    rows = [row for row in rows if row.loads] or rows  # without the linear solution
     most = max(row.loads for row in rows)
     best: dict[str, list[Row]] = {}
     for row in rows:
@@ -382,7 +383,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             right.plot([row.loads for row in some], [row.median for row in some], **style)
         left.set(xscale="log", yscale="log", xlabel="time of a prediction [ms]")
         left.set_ylabel("median relative L2 error")
-        right.set(xscale="log", xlabel="loads of the fit")
+        right.set(xscale="log" if most else "linear", xlabel="loads of the fit")
         for ax in (left, right):
             ax.grid(visible=True)
         figure.legend(loc="outside lower center", ncols=3, fontsize=6)
