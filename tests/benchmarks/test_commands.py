@@ -38,6 +38,10 @@ COMMANDS = {
         },
     ),
     "results of one load": (["name=tiny", "single=true"], {"tiny_single.csv": ("method", BOTH)}),
+    "rivals": (
+        [*SMALL, "counts=[8]", "models=[]", "rivals=[]", "count=2", "solver.linear=superlu"],
+        {"rivals.csv": ("method", ["linear solution"])},
+    ),
     "pareto": (
         [RUNS, *MODES],
         {
