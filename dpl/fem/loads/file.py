@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.identity import plain
@@ -27,7 +26,8 @@ class FileLoads(CombinedLoads):
 
     Attributes:
         path: An array in .npy, or a .npz file with one array: nodal forces (S, N, D) [N] (2D:
-            [N/m]), 2^27 numbers at most, the nodes in the order of `Problem.points`.
+            [N/m]), 2^27 numbers at most, the nodes in the order of `Problem.points`. Each force
+            acts on a free degree of freedom. The file need not be trusted.
         factor: Smallest and largest factor; None: `deflection` decides, and the unit of the forces
             has no effect.
     """
@@ -42,8 +42,15 @@ class FileLoads(CombinedLoads):
     @cached_property
     def _forces(self) -> Array:
         """Forces of the file, (S, N, D) [N]."""
+        free = self.problem.free.numpy()
         try:
-            return read_forces(self.path, self.problem.free.numpy())
+            forces = read_array(Path(self.path), free.shape)
+            for number, force in enumerate(forces):
+                if not np.isfinite(force).all():
+                    raise ValueError(f"force {number} must have finite components")
+                if not force[free].any():
+                    raise ValueError(f"force {number} must act on a free degree of freedom")
+            return forces
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else error
             raise ValueError(f"path = {self.path}: {' '.join(str(reason).split())}") from error
@@ -105,23 +112,3 @@ class FileLoads(CombinedLoads):
         options = super().identity()
         del options["path"], options["factor"]
         return options | {"forces": plain(self.shapes)}
-
-
-def read_forces(path: str | Path, free: NDArray[np.bool_]) -> Array:
-    """Return the forces of a .npy or .npz file, (S, N, D) [N].
-
-    Args:
-        path: The file, which need not be trusted, see `dpl.system.files.read_array`.
-        free: Free degrees of freedom, (N, D); each force must act on one.
-
-    Raises:
-        OSError: The file cannot be read.
-        ValueError: It does not contain one array of finite forces of this shape.
-    """
-    forces = read_array(Path(path), free.shape)
-    for number, force in enumerate(forces):
-        if not np.isfinite(force).all():
-            raise ValueError(f"force {number} must have finite components")
-        if not force[free].any():
-            raise ValueError(f"force {number} must act on a free degree of freedom")
-    return forces
