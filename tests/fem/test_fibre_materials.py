@@ -297,11 +297,9 @@ def test_forces_of_a_body_are_the_gradient_of_its_energy(name, generator):
 
 def test_identity_is_plain_data_that_tells_laws_apart(law, generator):
     twin = fem.FibreReinforced(law.matrix, law.fibres, law.frames.clone())
-    assert twin == law
-    assert hash(twin) == hash(law)
+    assert twin.identity() == law.identity()
     assert isinstance(law.identity()["directions"], str)
     other = fem.FibreReinforced(law.matrix, law.fibres, rotations(5, generator))
-    assert other != law
     assert other.identity() != law.identity()
     assert law.identity()["fibres"]["name"] == type(law.fibres).__name__
     spec = fem.FibreReinforced(law.matrix, law.fibres, fem.ConstantFibres([1.0, 0.0, 0.0]))

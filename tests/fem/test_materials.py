@@ -326,14 +326,6 @@ def test_tiny_gradients_keep_the_digits_of_hooke(law, gradients, size):
     assert error.max() < 1e-9
 
 
-def test_ogden_with_exponents_of_two_is_mooney_rivlin(gradients):
-    """Ib2 - 3 is the sum of lb^-2 - 1: c10 = mu1/2 and c01 = mu2/2 at exponents 2 and -2."""
-    law = TABULATED["Mooney-Rivlin"]
-    ogden = fem.OgdenK2([2 * law.c10, 2 * law.c01], [2.0, -2.0], law.bulk)
-    assert_close(ogden.energy(gradients), law.energy(gradients), rtol=1e-11, atol=1e-14)
-    assert_close(ogden.stress(gradients), law.stress(gradients), rtol=1e-11, atol=1e-13)
-
-
 def test_saint_venant_is_blind_to_reflection_and_lets_a_body_collapse():
     mirrored = torch.diag(torch.tensor([-2.0, 0.0, 0.0], dtype=torch.float64))
     assert SVK.energy(mirrored) == 0

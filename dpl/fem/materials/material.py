@@ -138,11 +138,6 @@ class Material(Parametrised):
         """The law as compiled loops take it; None if it has tensor operations only."""
         return None
 
-    @property
-    def classes(self) -> tuple[type, ...]:
-        """Classes of the law and its parts, for each of which kernels are compiled once."""
-        return (type(self),)
-
     def identity(self) -> dict[str, Any]:
         """Return class name and parameters as plain data."""
         return identity_of(self)
