@@ -198,6 +198,14 @@ def test_angle_through_a_cylinder_follows_the_logarithm_of_the_radius(cell):
     assert fine[1] < 0.05
 
 
+def test_a_wall_of_one_cell_has_directions_too():
+    """All nodes lie on its surfaces: the equation has no unknowns."""
+    frames = frames_on(wall(inner_angle=0.0, outer_angle=0.0), quarter_cylinder(1))
+    _, radial, around = polar(quarter_cylinder(1))
+    assert (frames[:, :, 0].numpy() * around).sum(1).min() > 0.95
+    assert (frames[:, :, 1].numpy() * radial).sum(1).min() > 0.95
+
+
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
 def test_directions_are_of_first_order_on_linear_meshes_and_of_second_on_curved_ones(cell):
     coarse, fine = (np.array(errors(quarter_cylinder(count, cell))) for count in (2, 4))
