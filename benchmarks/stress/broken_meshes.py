@@ -91,7 +91,7 @@ BROKEN_MESHES: dict[str, tuple[str, Any, dict[str, Any]]] = {
         {"hexahedron": np.concatenate([TWO_HEXES, TWO_HEXES + 12])},
     ),
     "two pieces": (
-        "2 pieces (of 12, 12 nodes)",
+        "2 parts (of 2, 2 cells); join",
         np.concatenate([TWO_CUBES, FAR]),
         {"hexahedron": np.concatenate([TWO_HEXES, TWO_HEXES + 12])},
     ),

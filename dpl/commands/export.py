@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from dpl import config, export, training
 from dpl.commands.cli import command
 from dpl.evaluation import tables
+from dpl.scene import Scene
 from dpl.system.files import atomic_write
 from dpl.version import install
 
@@ -57,9 +58,10 @@ def main(cfg: DictConfig) -> None:
         print(f"to share: {path.parent}; dpl.load reads this folder, also as hf://OWNER/NAME")
 
 
-def publish(cfg: DictConfig, run: DictConfig, scene: "dpl.Scene", folder: Path) -> Path:
+def publish(cfg: DictConfig, run: DictConfig, scene: Scene, folder: Path) -> Path:
     """Write what `dpl.load` needs of a run to a folder; return the card."""
-    kept = {key: node for key, node in config.to_container(run).items() if key in config.PREDICTION}
+    every = config.to_container(run)
+    kept = {key: every[key] for key in config.PREDICTION if key in every}
     _, files = config.with_copied_files(run, Path(cfg.run), required=True)
     copies = [own for _, own in files.values()]
     return export.write_published(

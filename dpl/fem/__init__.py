@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from dpl.fem.materials.invariant_based import InvariantBasedMaterial
     from dpl.fem.materials.isochoric import DemirayK2, MooneyRivlinK2, YeohK2
     from dpl.fem.materials.linear_elastic import LinearElastic, SaintVenantKirchhoff
-    from dpl.fem.materials.material import Material, YoungPoissonMaterial
+    from dpl.fem.materials.material import Material, Response, YoungPoissonMaterial
     from dpl.fem.materials.neo_hookean import (
         NeoHookeanIsoK2,
         NeoHookeanIsoK4,

@@ -198,6 +198,14 @@ def test_angle_through_a_cylinder_follows_the_logarithm_of_the_radius(cell):
     assert fine[1] < 0.05
 
 
+def test_a_wall_of_one_cell_has_directions_too():
+    """All nodes lie on its surfaces: the equation has no unknowns."""
+    frames = frames_on(wall(inner_angle=0.0, outer_angle=0.0), quarter_cylinder(1))
+    _, radial, around = polar(quarter_cylinder(1))
+    assert (frames[:, :, 0].numpy() * around).sum(1).min() > 0.95
+    assert (frames[:, :, 1].numpy() * radial).sum(1).min() > 0.95
+
+
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
 def test_directions_are_of_first_order_on_linear_meshes_and_of_second_on_curved_ones(cell):
     coarse, fine = (np.array(errors(quarter_cylinder(count, cell))) for count in (2, 4))
@@ -209,20 +217,16 @@ def test_directions_are_of_first_order_on_linear_meshes_and_of_second_on_curved_
     assert (fine < np.radians(0.3)).all()
 
 
-def test_angles_do_not_depend_on_size_and_place():
-    mesh = quarter_cylinder(3)
-    frames = frames_on(wall(), mesh)
+def test_directions_depend_neither_on_size_nor_on_place_and_surfaces_may_be_regions():
+    frames = frames_on(wall(), quarter_cylinder(3))
     moved = quarter_cylinder(3, scale=1e-3).translated([4.0, 0.0, 0.0])
     assert_close(frames_on(wall(), moved), frames, rtol=0, atol=1e-8)
-
-
-def test_surfaces_may_be_regions_in_metres():
-    mesh = quarter_cylinder(3, scale=10.0)
     regions = {
-        "inner": lambda x: np.hypot(x[:, 0], x[:, 1]) < 10.001,
+        "inner": lambda x: np.hypot(x[:, 0], x[:, 1]) < 10.001,  # [m]
         "outer": lambda x: np.hypot(x[:, 0], x[:, 1]) > 19.999,
     }
-    assert_close(frames_on(wall(**regions), mesh), frames_on(wall(), mesh), rtol=0, atol=1e-12)
+    large = quarter_cylinder(3, scale=10.0)
+    assert_close(frames_on(wall(**regions), large), frames_on(wall(), large), rtol=0, atol=1e-12)
 
 
 # ------------------------------------------------------------------ errors

@@ -100,6 +100,7 @@ def test_a_load_is_a_function_of_seed_and_number(build, linear, name, sampling):
     drawn = loads.sample(3, range(6)).force
     assert torch.equal(drawn, build(name, linear, sampling=sampling).sample(3, range(6)).force)
     assert torch.equal(drawn[4:5], loads.sample(3, [4]).force)
+    assert torch.equal(2 * drawn, loads.sample(3, range(6), amplitude=2.0).force)
     assert torch.equal(drawn, pickle.loads(pickle.dumps(loads)).sample(3, range(6)).force)
     assert not torch.equal(drawn, loads.sample(4, range(6)).force)
     assert loads.points(0, range(2)).shape == (2, loads.n_random)

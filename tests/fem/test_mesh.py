@@ -399,13 +399,6 @@ def test_several_blocks_of_one_kind_are_one_body(tmp_path):
     assert fem.read_mesh(tmp_path / "bar.vtu").t.shape == (8, 2)
 
 
-def test_missing_file_is_an_error(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.vtu"):
-        fem.read_mesh(tmp_path / "none.vtu")
-    with pytest.raises(FileNotFoundError):
-        fem.read_mesh(tmp_path)
-
-
 @pytest.mark.parametrize("name", ["junk.vtu", "junk.msh", "junk.vtk", "junk.inp", "junk.what"])
 def test_unreadable_file_is_an_error_that_names_it(tmp_path, name):
     """On some of these files meshio calls sys.exit."""

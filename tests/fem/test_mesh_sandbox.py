@@ -310,6 +310,8 @@ def test_pipes_and_devices_are_refused_and_folders_are_no_files(tmp_path, suffix
     (tmp_path / f"folder.{suffix}").mkdir()
     with pytest.raises(FileNotFoundError, match="folder"):
         read_mesh(tmp_path / f"folder.{suffix}")
+    with pytest.raises(FileNotFoundError, match=r"none\.vtu: no such"):
+        read_mesh(tmp_path / "none.vtu")
     with pytest.raises(FileNotFoundError, match="no such"):
         read_mesh(tmp_path / f"no\0ne.{suffix}")
 

@@ -163,10 +163,3 @@ def test_no_point_is_drawn_with_a_warning(drawn):
 def test_random_access_to_a_sobol_sequence_equals_its_order():
     engine = qmc.Sobol(5, scramble=True, rng=np.random.default_rng([7, 2]))
     assert np.array_equal(stream(sobol, (7, 2), 64, 5), engine.random(64))
-
-
-@pytest.mark.parametrize("size", [16, 64])
-def test_every_interval_holds_one_coordinate_of_a_sobol_sequence(size):
-    """Sobol (1967): each coordinate is a (0, 1)-sequence in base 2, scrambled or not."""
-    cells = np.sort(np.floor(stream(sobol, 2, size, 9) * size), axis=0)
-    assert np.array_equal(cells, np.repeat(np.arange(size)[:, None], 9, axis=1))

@@ -1,4 +1,4 @@
-"""Limits of time and memory for what one input may take."""
+"""Limits of time and memory of one input, and of the number of inputs."""
 
 import resource
 import signal
@@ -7,12 +7,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from hypothesis import settings
+
 LIMIT = 200.0  # on a busy machine, below that of a test [s]
 MEMORY = 1.0  # [GB]
 
 
 class Late(BaseException):
     """An input took too long."""
+
+
+def at_most(part: float) -> settings:
+    """Return the settings of a test with `part` as many inputs as the others."""
+    return settings(max_examples=max(1, round(settings.default.max_examples * part)))
 
 
 @contextmanager

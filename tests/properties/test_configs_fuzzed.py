@@ -15,12 +15,11 @@ import hydra
 import lightning as L
 import pytest
 import torch
-from bounds import bounded
+from bounds import at_most, bounded
 from hydra.core.global_hydra import GlobalHydra
 from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
-from tried import at_most, counted
 
 from dpl import DataSetError
 from dpl.config import build, plain
@@ -237,7 +236,6 @@ def elsewhere(monkeypatch, tmp_path):
 
 @at_most(4)
 @given(harmed())
-@counted
 def test_a_configuration_is_refused_by_the_key_or_works(elsewhere, change):
     line = refused(change[1], elsewhere, own_keys(change[0]))
     judge(change, line)
@@ -286,7 +284,6 @@ FUNCTIONS = {  # they compute a mesh, an array or a schedule and have no other e
 @given(
     st.sampled_from(NAMES), st.sampled_from(["mesh", "loss", "trainer", "callbacks.x", "logger.x"])
 )
-@counted
 def test_what_a_runs_folder_may_name_is_of_a_kind_that_a_run_is_made_of(name, key):
     """Whatever else our modules have imported, functions with a reach of their own included."""
     cfg = OmegaConf.create({"trainer": {"_target_": "lightning.Trainer"}})

@@ -15,7 +15,6 @@ from bounds import bounded
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import load, save
-from tried import counted
 
 from dpl import DataSetError
 from dpl.data import DataModule, DataSet, Store
@@ -189,7 +188,6 @@ def strike(folder: Path, blow) -> None:
 
 
 @given(st.lists(blows(), min_size=1, max_size=2))
-@counted
 def test_damaged_files_give_the_written_samples_or_an_error(scene, sound, damage):
     with copied(sound.folder) as folder:
         for blow in damage:
@@ -217,7 +215,6 @@ def entries(node, path=()) -> Iterator[tuple]:
 
 
 @given(st.data())
-@counted
 def test_a_text_file_with_arbitrary_values_gives_the_samples_or_an_error(scene, sound, data):
     name = data.draw(st.sampled_from(["scene.json", "journal.jsonl"]))
     with copied(sound.folder) as folder:
@@ -299,7 +296,6 @@ HEADERS = [
 
 
 @given(st.data())
-@counted
 def test_a_shard_with_wrong_numbers_and_a_right_digest_is_refused_or_found(scene, sound, data):
     name = data.draw(st.sampled_from([*SHARDS, "modes"])) + ".safetensors"
     with copied(sound.folder) as folder:

@@ -18,10 +18,10 @@ from bodies import (
     rotation,
     seeds,
 )
+from bounds import at_most
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from torch import Tensor
-from tried import at_most, counted
 
 from dpl import fem
 from dpl.fem.linear import full_matrix
@@ -72,7 +72,6 @@ def check_same(problem: fem.Problem, load: fem.Load, found: Tensor, expected: Te
     turn=seeds,
     shift=st.floats(-3, 3),
 )
-@counted
 def test_turned_and_moved_body_stores_as_much_and_feels_turned_forces(
     body, steepness, seed, turn, shift
 ):
@@ -100,7 +99,6 @@ class Uncompiled(fem.Problem):
 
 
 @given(body=bodies((*HELD, "free")), steepness=steepnesses, seed=seeds, length=st.floats(0.1, 1))
-@counted
 def test_compiled_loops_say_what_tensors_say(body, steepness, seed, length):
     """Forces, volume ratios and tangents, with mixed points and without."""
     problem = body.build()
@@ -123,14 +121,10 @@ def test_compiled_loops_say_what_tensors_say(body, steepness, seed, length):
         assert (system.tangent - tangent).norm() <= unit
 
 
-# ---------------------------------------------------------------- supports and loads
-
-
 # ---------------------------------------------------------------- the linear solution
 
 
 @given(case=cases(supports=UNMOVED), other=seeds, data=st.data())
-@counted
 def test_linear_answers_are_reciprocal(case, other, data):
     """Maxwell, Betti: the work of a load on the answer to another is that of the other on its."""
     body, push = case
@@ -143,7 +137,6 @@ def test_linear_answers_are_reciprocal(case, other, data):
 
 
 @given(case=cases(supports=UNMOVED, low=1e-12, high=1e-5))
-@counted
 def test_small_loads_have_an_answer_that_follows_the_linear_one(case):
     body, push = case
     newton = fem.Newton(body.build())
@@ -202,7 +195,6 @@ def check_states(newton: fem.Newton, load: fem.Load, states: list[fem.Solution])
 
 
 @given(case=cases(), mixed=st.booleans(), budget=st.sampled_from([1, 5, 60]))
-@counted
 def test_states_of_newton_are_not_inverted_and_say_what_they_are(case, mixed, budget):
     body, push = case
     newton = fem.Newton(body.build(), mixed_integration=mixed, max_total_iter=budget)
@@ -211,7 +203,6 @@ def test_states_of_newton_are_not_inverted_and_say_what_they_are(case, mixed, bu
 
 
 @given(case=cases(), steepness=logarithmic(1e-3, 3.0), seed=seeds)
-@counted
 def test_newton_says_the_same_of_states_from_any_guess(case, steepness, seed):
     body, push = case
     newton = fem.Newton(body.build(), max_total_iter=40)
@@ -227,7 +218,6 @@ def test_newton_says_the_same_of_states_from_any_guess(case, steepness, seed):
 
 
 @given(case=cases(low=1e-2, high=3.0))
-@counted
 def test_answer_that_counts_as_stable_is_a_minimum(case):
     """The inertia of its tangent is what the solution says, and near it the energy is higher.
 
@@ -260,7 +250,6 @@ def test_answer_that_counts_as_stable_is_a_minimum(case):
 
 
 @given(case=cases(low=1e-3, high=0.3), factor=logarithmic(1e-6, 1e6), young=logarithmic(1, 1e12))
-@counted
 def test_answer_depends_neither_on_the_size_of_the_body_nor_on_its_modulus(case, factor, young):
     body, push = case
     newton = fem.Newton(body.build(), max_total_iter=60)
@@ -276,7 +265,6 @@ def test_answer_depends_neither_on_the_size_of_the_body_nor_on_its_modulus(case,
 
 
 @given(case=cases(supports=UNMOVED, low=1e-3, high=0.3), turn=seeds, shift=st.floats(0, 5))
-@counted
 def test_answer_turns_with_body_supports_and_load(case, turn, shift):
     """In metres: the turned body may be measured by another side of another box around it."""
     body, push = case
@@ -300,7 +288,6 @@ def test_answer_turns_with_body_supports_and_load(case, turn, shift):
 
 @at_most(0.5)
 @given(case=cases(low=1e-3, high=0.2), data=st.data())
-@counted
 def test_ways_to_solve_change_the_way_and_not_the_answer(case, data):
     body, push = case
     newton = fem.Newton(body.build(), max_total_iter=60)
@@ -320,7 +307,6 @@ def test_ways_to_solve_change_the_way_and_not_the_answer(case, data):
 
 
 @given(case=cases(low=1e-3, high=1.0))
-@counted
 def test_images_of_an_answer_answer_the_images_of_its_load(case):
     body, push = case
     body = replace(body, grading=(1.0,) * body.dim, shaken=0.0)

@@ -14,10 +14,10 @@ import meshio
 import numpy as np
 import pytest
 import skfem
+from bounds import at_most
 from hypothesis import given
 from hypothesis import strategies as st
 from skfem.io.meshio import to_meshio
-from tried import at_most, counted
 
 from dpl.fem import box, read_mesh, rectangle
 from dpl.fem.mesh import check_mesh, sandbox
@@ -197,7 +197,6 @@ def sound(mesh: skfem.Mesh) -> bool:
 @pytest.mark.parametrize("kind", KINDS)
 @at_most(0.2)
 @given(cell=st.sampled_from(list(BODIES)), changes=st.lists(CHANGES, min_size=1, max_size=3))
-@counted
 def test_a_damaged_file_is_an_error_in_one_line_or_a_sound_mesh(
     kind, cell, changes, tmp_path_factory
 ):

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.identity import plain
@@ -30,7 +29,8 @@ class FileLoads(CombinedLoads):
 
     Attributes:
         path: Nodal forces (S, N, D) [N] (2D: [N/m]), 2^27 numbers at most: a file of arrays or a
-            folder of VTK files, see `dpl.fem.mesh.nodal_fields`.
+            folder of VTK files, see `dpl.fem.mesh.nodal_fields`. Each force acts on a free degree
+            of freedom.
         factor: Smallest and largest factor; None: `deflection` decides, and the unit of the forces
             has no effect.
         field: Name of the array, in a file with several.
@@ -56,7 +56,12 @@ class FileLoads(CombinedLoads):
         points = body.length * (body.origin + body.points.numpy())
         try:
             (forces,) = read_nodal_fields(self.path, names, points, self.scale)
-            return self.unit * checked_forces(forces, body.free.numpy())
+            for number, force in enumerate(forces):
+                if not np.isfinite(force).all():
+                    raise ValueError(f"force {number} must have finite components")
+                if not force[body.free.numpy()].any():
+                    raise ValueError(f"force {number} must act on a free degree of freedom")
+            return self.unit * forces
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else error
             raise ValueError(f"path = {self.path}: {' '.join(str(reason).split())}") from error
@@ -138,17 +143,3 @@ def _sketch(vectors: Tensor) -> Tensor:
     signs = 2.0 * torch.randint(2, (n,), generator=generator) - 1
     buckets = torch.randint(BUCKETS, (n,), generator=generator)
     return vectors.new_zeros(len(vectors), BUCKETS).index_add_(1, buckets, signs * vectors)
-
-
-def checked_forces(forces: Array, free: NDArray[np.bool_]) -> Array:
-    """Return forces (S, N, D) that are finite and act on a free degree of freedom (N, D).
-
-    Raises:
-        ValueError: A force does not; the message names its number.
-    """
-    for number, force in enumerate(forces):
-        if not np.isfinite(force).all():
-            raise ValueError(f"force {number} must have finite components")
-        if not force[free].any():
-            raise ValueError(f"force {number} must act on a free degree of freedom")
-    return forces

@@ -1,10 +1,12 @@
 """Least-squares fit of a force by a few fixed forces, by which families recognise their loads."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from torch import Tensor
 
 Array = NDArray[np.float64]
 LEAST_SQUARE = 1e-13  # singular value of the normal equations over the largest that counts [-]
@@ -51,6 +53,22 @@ def fit(
     bounded = lsq_linear(root, wanted, bounds, method="bvls", tol=EDGE**2).x
     is_same = np.linalg.norm(root @ bounded - wanted) <= EDGE * np.linalg.norm(wanted)
     return (np.clip(largest * bounded, low, high) if is_same else q), residual
+
+
+def project(
+    shapes: Array, forces: Tensor, span: tuple[float, float], amplitude: Callable[[Array], Array]
+) -> tuple[Tensor, Tensor]:
+    """Return the largest amplitudes and the relative residuals of forces, (B,) each, see `fit`.
+
+    Args:
+        shapes: Fixed forces, (N, D, K).
+        forces: The forces, (B, N, D).
+        span: Range of the coefficients of a load.
+        amplitude: Function of the coefficients (K,) that returns amplitudes, (K,) or (1,).
+    """
+    fits = [fit(shapes, force, *span) for force in forces.numpy()]
+    largest = [amplitude(coefficients).max() for coefficients, _ in fits]
+    return forces.new_tensor(largest), forces.new_tensor([residual for _, residual in fits])
 
 
 @njit(cache=True)

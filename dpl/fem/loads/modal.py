@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.loads.family import SurfaceLoads
-from dpl.fem.loads.fit import amplitudes, fit
+from dpl.fem.loads.fit import amplitudes, project
 from dpl.fem.loads.modal_basis import Modes, eigenmodes
 from dpl.fem.loads.sampling import Array, Quantile, constant, symmetric_uniform, uniform01
 from dpl.fem.loads.sized import MIN_DEFLECTION
@@ -130,14 +130,8 @@ class ModalLoads(SurfaceLoads):
         Args:
             force: (B, N, D) [-].
         """
-        pairs = [self._fit(f) for f in self.own_force(force).numpy()]
-        amplitudes, residuals = zip(*pairs, strict=True)
-        return force.new_tensor(amplitudes), force.new_tensor(residuals)
-
-    def _fit(self, force: Array) -> tuple[float, float]:
-        """Return amplitude and residual of one force, (N, D), see `project`."""
-        q, residual = fit(self.modal_forces.numpy(), force, *self._span)
-        return float(amplitudes(q, *self._span, 1.0).max()), residual
+        shapes, span = self.modal_forces.numpy(), self._span
+        return project(shapes, self.own_force(force), span, lambda q: amplitudes(q, *span, 1.0))
 
     @cached_property
     def _span(self) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.loads.family import RandomLoads
-from dpl.fem.loads.fit import amplitudes, fit
+from dpl.fem.loads.fit import amplitudes, project
 from dpl.fem.loads.sampling import Array, direction
 from dpl.fem.options import DIMENSIONLESS, declared, option, shown
 from dpl.fem.solvers.linear import LinearSolver
@@ -160,11 +160,10 @@ class CombinedLoads(SizedLoads):
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return amplitudes and relative residuals of a least-squares fit, see `LoadFamily`."""
         # as of one node with N D components, so that entries without a force count, too
-        shapes, span = self._acting_shapes[None], self.coefficient_range
-        forces = self.own_force(force).flatten(1)[:, None].numpy()
-        fits = [fit(shapes, own, *span) for own in forces]
-        largest = [self.amplitudes(self.sizes_of(c)).max() for c, _ in fits]
-        return force.new_tensor(largest), force.new_tensor([rest for _, rest in fits])
+        shapes, own = self._acting_shapes[None], self.own_force(force).flatten(1)[:, None]
+        return project(
+            shapes, own, self.coefficient_range, lambda c: self.amplitudes(self.sizes_of(c))
+        )
 
     @cached_property
     def _acting_shapes(self) -> Array:

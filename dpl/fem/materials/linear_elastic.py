@@ -68,11 +68,6 @@ class SmallStrains(Hookean):
         hooke = hooke + 2 * with_axes(self.mu, 4) * symmetric_product(eye)
         return hooke.expand(*H.shape, 3, 3)
 
-    @property
-    def has_response(self) -> bool:
-        """No: its stress is no function of the Green-Lagrange strain."""
-        return False
-
 
 @dataclass(frozen=True)
 class LinearElastic(YoungPoissonMaterial, SmallStrains):

@@ -6,7 +6,7 @@ its stress as a difference of terms that cancel at rest.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from itertools import product
 from typing import Any, ClassVar, NamedTuple, Self
@@ -86,8 +86,8 @@ class Material(Parametrised):
 
     @property
     def has_response(self) -> bool:
-        """Whether the law gives its stress as a function of strain."""
-        return type(self).response is not Material.response
+        """Whether the law gives its stress as a function of the Green-Lagrange strain."""
+        return self.finite and type(self).response is not Material.response
 
     def stress(self, H: Tensor) -> Tensor:
         """Return the first Piola-Kirchhoff stress P = dW/dF over E, (..., 3, 3) [-]."""
@@ -137,11 +137,6 @@ class Material(Parametrised):
     def compiled_form(self) -> CompiledForm | None:
         """The law as compiled loops take it; None if it has tensor operations only."""
         return None
-
-    @property
-    def classes(self) -> tuple[type, ...]:
-        """Classes of the law and its parts, for each of which kernels are compiled once."""
-        return (type(self),)
 
     def identity(self) -> dict[str, Any]:
         """Return class name and parameters as plain data."""
@@ -298,8 +293,21 @@ class BulkOrPoisson(Material, Scalable):
     In place of `bulk`, Poisson's ratio at rest may be given: K = 2 mu (1 + nu) / (3 (1 - 2 nu)).
     """
 
+    shear_name: ClassVar[str]  # the shear modulus at rest in terms of the constants, in a message
     bulk: Constant | None
     poisson: Constant | None
+
+    def check_constants(self) -> None:
+        """Check that the body resists shear and compression at rest."""
+        shear, bulk = float(self.mu), float(self.bulk_modulus)
+        if not 0 < shear < math.inf:
+            words = "it is the shear modulus at rest"
+            raise ValueError(f"{self.shear_name} = {shear:g} must be above 0: {words}")
+        if not 0 < bulk < math.inf:
+            raise ValueError(f"bulk = {bulk:g} must be above 0")
+        constants = list(map(float, self.constants))
+        if not all(map(math.isfinite, constants)):
+            raise ValueError(f"moduli = {constants} must be finite numbers")
 
     def __post_init__(self) -> None:
         if (self.bulk is None) == (self.poisson is None):
@@ -331,13 +339,3 @@ def vector_of(*moduli: Tensor) -> Tensor:
     """Return moduli, each of all cells, as one vector (1, M) or (B, M)."""
     columns = torch.broadcast_tensors(*moduli, torch.zeros(1, 1, 1))[:-1]
     return torch.cat(columns, dim=1)[..., 0]
-
-
-def check_moduli(name: str, shear: float, bulk: float, constants: Iterable[float]) -> None:
-    """Check the constants of a law, and the moduli at rest that follow."""
-    if not 0 < shear < math.inf:
-        raise ValueError(f"{name} = {shear} must be above 0: it is the shear modulus at rest")
-    if not 0 < bulk < math.inf:
-        raise ValueError(f"bulk = {bulk:g} must be above 0")
-    if not all(math.isfinite(constant) for constant in constants):
-        raise ValueError(f"moduli = {list(constants)} must be finite numbers")

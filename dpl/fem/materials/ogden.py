@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.material import BulkOrPoisson, Response, check_moduli
+from dpl.fem.materials.material import BulkOrPoisson, Response
 from dpl.fem.materials.tensors import green_lagrange, volume_change
 from dpl.fem.options import option
 
@@ -30,6 +30,7 @@ class OgdenK2(BulkOrPoisson):
     """
 
     dimensional: ClassVar[tuple[str, ...]] = ("shear", "bulk")
+    shear_name: ClassVar[str] = "sum of shear"
 
     shear: Sequence[float]
     exponents: Sequence[float]
@@ -42,9 +43,12 @@ class OgdenK2(BulkOrPoisson):
             raise ValueError(
                 f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"
             )
-        bulk = float(self.bulk_modulus)
-        constants = [*self.shear, *self.exponents, bulk]
-        check_moduli("sum of shear", sum(self.shear), bulk, constants)
+        super().check_constants()
+
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """Return all mu_i and alpha_i."""
+        return *self.shear, *self.exponents
 
     @property
     def mu(self) -> Tensor:

@@ -5,7 +5,6 @@ mesh: a `Tag`, or a string, which means the `Tag` of that name. `nodes_in`, `fac
 `cells_in` are the only functions that evaluate regions, and take all of them.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -14,6 +13,7 @@ import skfem
 from numpy.typing import NDArray
 
 from dpl.fem.options import check_options, option
+from dpl.fem.units import vector
 
 SLACK = 1e-6  # geometric tolerance over the size of the body or of the region
 
@@ -27,11 +27,11 @@ class Plane:
         at: Coordinate of the plane [m], or "min" or "max" for the extreme nodes of the body.
     """
 
-    axis: int
+    axis: int = option("", least=0, most=2)
     at: float | str
 
     def __post_init__(self) -> None:
-        _check_axis(self.axis)
+        check_options(self)
         if isinstance(self.at, str) and self.at not in ("min", "max"):
             raise ValueError(f"at = {self.at!r} must be min, max or a coordinate [m]")
 
@@ -61,10 +61,11 @@ class Box:
             raise ValueError(f"lower = {lower} must not be above upper = {upper}")
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        _check_dimension("lower", self.lower, points)
         slack = SLACK * np.ptp(points, axis=0).max()
-        inside = (points >= np.array(self.lower) - slack) & (points <= np.array(self.upper) + slack)
-        return inside.all(axis=1)
+        lower, upper = (
+            vector(name, getattr(self, name), points.shape[1], "m") for name in ("lower", "upper")
+        )
+        return ((points >= lower - slack) & (points <= upper + slack)).all(axis=1)
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,6 @@ class Sphere:
 
     def __post_init__(self) -> None:
         check_options(self)
-        _check_centre(self.centre)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         return _in_ball(points, self.centre, self.radius, range(points.shape[1]))
@@ -99,14 +99,12 @@ class Cylinder:
         centre: A point of the axis, D coordinates [m]; default: the origin.
     """
 
-    axis: int
+    axis: int = option("", least=0, most=2)
     radius: float = option("m", above=0.0)
     centre: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         check_options(self)
-        _check_axis(self.axis)
-        _check_centre(() if self.centre is None else self.centre)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         centre = [0.0] * points.shape[1] if self.centre is None else self.centre
@@ -259,23 +257,7 @@ def _in_ball(
     points: NDArray[np.float64], centre: Sequence[float], radius: float, axes: Sequence[int]
 ) -> NDArray[np.bool_]:
     """Return a mask (N,) of the points (N, D) at most a radius from a centre along some axes."""
-    _check_dimension("centre", centre, points)
-    away = (points - np.array(centre, dtype=np.float64))[:, list(axes)]
+    away = (points - vector("centre", centre, points.shape[1], "m"))[:, list(axes)]
     # tolerances for the rounding of the radius and for that of large coordinates
     slack = radius * SLACK + 4 * np.finfo(np.float64).eps * np.abs(points).max()
     return np.linalg.norm(away, axis=1) <= radius + slack
-
-
-def _check_axis(axis: int) -> None:
-    if axis not in (0, 1, 2):
-        raise ValueError(f"axis = {axis} must be 0, 1 or 2")
-
-
-def _check_centre(centre: Sequence[float]) -> None:
-    if not all(map(math.isfinite, centre)):
-        raise ValueError(f"centre = {list(centre)} must be finite coordinates [m]")
-
-
-def _check_dimension(name: str, corner: Sequence[float], points: NDArray[np.float64]) -> None:
-    if len(corner) != points.shape[1]:
-        raise ValueError(f"{name} = {list(corner)} must have {points.shape[1]} coordinates")

@@ -6,6 +6,7 @@ import meshio
 import numpy as np
 import skfem
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 SIDES = {"line": 2, "triangle": 3, "quad": 4}  # vertices of a facet, which come first
 MAX_VALUES = 1000  # distinct values of an integer field that becomes tags
@@ -60,15 +61,10 @@ def add_tags(mesh: skfem.Mesh, raw: meshio.Mesh, kind: str, corners: Numbers) ->
 
 def _find_facets(mesh: skfem.Mesh, sides: Numbers) -> Numbers:
     """Return the facet with the vertices of each side (n, corners), or -1, shape (n,)."""
-    both = np.sort(np.concatenate([mesh.facets.T, sides]), axis=1)
-    both = both[:, : mesh.dim()]  # three vertices identify a facet
-    order = np.lexsort(both.T)  # stable: a facet precedes the sides equal to it
-    new = np.ones(len(both), dtype=bool)
-    new[1:] = (np.diff(both[order], axis=0) != 0).any(axis=1)
-    first = order[new][np.cumsum(new) - 1]
-    found = np.empty(len(both), dtype=np.int64)
-    found[order] = np.where(first < mesh.facets.shape[1], first, -1)
-    return found[mesh.facets.shape[1] :]
+    # three vertices identify a facet; their numbers are the coordinates of a lattice
+    known, wanted = (np.sort(v, axis=1)[:, : mesh.dim()] for v in (mesh.facets.T, sides))
+    distance, found = cKDTree(known).query(wanted)
+    return np.where(distance == 0, found, -1)
 
 
 def _cell_sets(raw: meshio.Mesh) -> Iterator[tuple[str, int, Numbers]]:

@@ -36,7 +36,6 @@ def check_mesh(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mes
     _check_sides(mesh, orientation)
     _check_coincidence(mesh, numbers)
     _check_contacts(mesh, numbers)
-    _check_pieces(mesh)
     _check_joints(mesh, numbers)
     return mesh
 
@@ -240,32 +239,19 @@ def _distance(
     return np.where(within, np.sqrt((gap**2).sum(axis=0)), np.inf)
 
 
-def _check_pieces(mesh: skfem.Mesh) -> None:
-    links = np.stack([np.tile(mesh.t[0], len(mesh.t) - 1), mesh.t[1:].ravel()])
-    pieces, _, sizes = _components(links, mesh.nvertices)
-    if pieces > 1:
-        raise ValueError(
-            f"the body is in {pieces} pieces (of {sizes} nodes); join or separate them"
-        )
-
-
-def _components(links: Numbers, size: int) -> tuple[int, Numbers, str]:
-    """Return number, members (size,) and listed sizes of the parts connected by links (2, n)."""
-    graph = coo_array((np.ones(links.shape[1]), links), shape=(size, size))
-    parts, member = connected_components(graph, directed=False)
-    return parts, member, listed(np.sort(np.bincount(member))[::-1], 8)
-
-
 def _check_joints(mesh: skfem.Mesh, numbers: Numbers) -> None:
     """Raise unless cells are connected by sides: parts that touch in nodes or edges are hinged."""
-    parts, member, sizes = _components(mesh.f2t[:, mesh.f2t[1] >= 0], mesh.nelements)
+    links = mesh.f2t[:, mesh.f2t[1] >= 0]
+    graph = coo_array((np.ones(links.shape[1]), links), shape=(mesh.nelements, mesh.nelements))
+    parts, member = connected_components(graph, directed=False)
     if parts > 1:
+        sizes = listed(np.sort(np.bincount(member))[::-1], 8)
         pairs = np.stack([mesh.t.ravel(), np.tile(member, len(mesh.t))])
-        both = np.unique(pairs, axis=1)
-        touching = np.flatnonzero(np.bincount(both[0]) > 1)
+        touching = np.flatnonzero(np.bincount(np.unique(pairs, axis=1)[0]) > 1)
+        where = f" that touch only in nodes or edges: {_nodes(touching, numbers)}"
         raise ValueError(
-            f"the body is in {parts} parts (of {sizes} cells) that touch only in nodes or edges: "
-            f"{_nodes(touching, numbers)}; join them by sides of cells or separate them"
+            f"the body is in {parts} parts (of {sizes} cells){where if len(touching) else ''}; "
+            "join them by sides of cells or separate them"
         )
 
 

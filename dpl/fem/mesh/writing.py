@@ -9,6 +9,7 @@ from xml.sax.saxutils import escape, quoteattr
 import meshio
 import numpy as np
 import skfem
+from meshio._vtk_common import meshio_to_vtk_type
 from meshio.xdmf import TimeSeriesWriter
 from numpy.typing import NDArray
 from skfem.io.meshio import to_meshio
@@ -16,10 +17,6 @@ from skfem.io.meshio import to_meshio
 from dpl.fem.mesh.regions import group_names
 
 MIRRORED = [1, 0, 2, 3, 4, 6, 5, 8, 7, 9]  # exchange of the first two corners of a tetrahedron
-VTK_TYPES = {  # numbers of the cell types of meshio, from vtkCellType.h
-    **{"triangle": 5, "quad": 9, "tetra": 10, "hexahedron": 12},
-    **{"triangle6": 22, "tetra10": 24, "quad9": 28, "hexahedron27": 29},
-}
 Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
 
@@ -185,7 +182,7 @@ def _write_vtkhdf(path: Path, bodies: Sequence[meshio.Mesh]) -> Path:
         "Points": body.points,
         "Connectivity": block.data.ravel(),
         "Offsets": np.arange(len(block.data) + 1) * block.data.shape[1],
-        "Types": np.full(len(block.data), VTK_TYPES[block.type], dtype=np.uint8),
+        "Types": np.full(len(block.data), meshio_to_vtk_type[block.type], dtype=np.uint8),
         "Steps/Values": np.arange(steps, dtype=np.float64),
         "Steps/NumberOfParts": once + 1,
         "Steps/PartOffsets": once,

@@ -13,9 +13,8 @@ import numpy as np
 import skfem
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import diags_array
-from scipy.sparse.linalg import cg
 from skfem.models.poisson import laplace
+from skfem.utils import solver_iter_pcg
 from torch import Tensor
 
 from dpl.fem.materials.fibres.reinforced import FibreDirections
@@ -229,17 +228,7 @@ def _laplace(
         raise ValueError(f"inner and outer must not touch; they share {len(both)} nodes")
     values = np.zeros(basis.N)
     values[outer] = 1.0
-    free = np.setdiff1d(np.arange(basis.N), np.concatenate([inner, outer]))
-    matrix = laplace.assemble(basis).tocsr()
-    if len(free):
-        block = matrix[free][:, free]
-        right = -(matrix @ values)[free]
-        inverse = diags_array(1 / block.diagonal())
-        values[free], failed = cg(block, right, rtol=LAPLACE_TOL, M=inverse)
-        if failed:
-            raise ValueError(
-                "inner and outer must be surfaces of one wall: no solution between them"
-            )
-    field = basis.interpolate(values)
+    system = skfem.condense(laplace.assemble(basis), x=values, D=np.concatenate([inner, outer]))
+    field = basis.interpolate(skfem.solve(*system, solver=solver_iter_pcg(rtol=LAPLACE_TOL)))
     slopes = field.grad.reshape(len(field.grad), -1)
     return np.asarray(field).ravel(), np.ascontiguousarray(slopes.T)

@@ -76,22 +76,10 @@ class FibreReinforced(Composed, Material):
         if isinstance(self.directions, Tensor) and not torch.compiler.is_compiling():
             _check_frames(self.directions)
 
-    def __eq__(self, other: object) -> bool:
-        """Return True for a law of the same constants and frames."""
-        return isinstance(other, FibreReinforced) and self.identity() == other.identity()
-
-    def __hash__(self) -> int:
-        """Return a hash that equal laws share."""
-        return hash((type(self), self.matrix, self.fibres))
-
     @property
     def finite(self) -> bool:  # type: ignore[override]
         """False for a term of K(0) only."""
         return self.matrix.finite
-
-    @property
-    def classes(self) -> tuple[type, ...]:
-        return type(self), type(self.matrix), type(self.fibres)
 
     @property
     def parts(self) -> Mapping[str, Any]:
