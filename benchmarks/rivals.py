@@ -1,7 +1,8 @@
 """Compare models with those of other packages on the same loads: python scripts/rivals.py.
 
-Each method is fitted to the first 64, 256 and 1,024 loads of one data set, by one thread, and each
-network of another package is trained for the same time. Methods of other packages learn twice: the
+Each method is fitted to the first 64, 256 and 1,024 loads of one data set and their images under
+the symmetries of the body, by one thread, and each network of another package is trained for the
+same time. Methods of other packages learn twice: the
 displacement from the force (`plain`), and the nonlinear displacement from the linear solution, with
 the whitening and the gate of this package (`linear`). Packages that are not installed are left out;
 requirements are in benchmarks/rivals.txt.
@@ -30,6 +31,7 @@ from benchmarks.subcommands import run_script
 from dpl import Sample, config
 from dpl.commands.cli import command
 from dpl.evaluation.timing import latency
+from dpl.fem.symmetry import SymmetryGroup
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import ErrorMetrics
@@ -39,6 +41,8 @@ Array = NDArray[np.float64]
 Predict = Callable[[Array], Array]
 Regression = Callable[..., tuple[Predict, int]]  # returns a prediction and the number of weights
 BASES: Mapping[str, type[Predictor]] = {"plain": Scaled, "linear": OnLinearSolution}
+MAX_ROWS = 4096  # samples and images to which a kernel method is fitted
+MAX_PROCESS = 1024  # of a Gaussian process, whose likelihood is maximised
 INPUTS, OUTPUTS = 120, 200  # numbers of POD coordinates
 WIDTH = 256  # of the layers of a branch network
 OF_STUDY = ("counts", "models", "rivals", "seconds", "count", "folder", "run", "name")
@@ -82,7 +86,7 @@ def kernel_ridge(X: Array, Y: Array, held: tuple[Array, Array], _: float) -> tup
 
     weight = 1 / np.linalg.norm(Y, axis=1)
     scale = 1 / np.median(np.square(X - X.mean(axis=0)).sum(axis=1))
-    fits = []
+    fits: list[tuple[float, int, Any]] = []
     for gamma in scale * np.array([0.03, 0.1, 0.3, 1.0]):
         for alpha in 10.0 ** np.arange(-9, -2, 2):
             model = KernelRidge(alpha=alpha, kernel="rbf", gamma=gamma)
@@ -99,6 +103,7 @@ def gaussian_process(
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
+    X, Y = X[:MAX_PROCESS], Y[:MAX_PROCESS]
     length = float(np.sqrt(np.square(X - X.mean(axis=0)).sum(axis=1).mean()))
     kernel = ConstantKernel() * RBF(length, (0.1 * length, 100 * length)) + WhiteKernel(1e-6)
     model = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0).fit(
@@ -123,7 +128,8 @@ def vkoga(X: Array, Y: Array, held: tuple[Array, Array], _: float) -> tuple[Pred
     from pymor.core.logger import set_log_levels
 
     set_log_levels({"pymor": "ERROR"})
-    length, fits = float(np.sqrt(np.square(X - X.mean(axis=0)).sum(axis=1).mean())), []
+    length = float(np.sqrt(np.square(X - X.mean(axis=0)).sum(axis=1).mean()))
+    fits: list[tuple[float, int, Any]] = []
     for factor in (1.0, 3.0, 10.0):
         kernel = GaussianKernel(factor * length)
         model = VKOGARegressor(kernel, max_centers=min(len(X), 500), tol=1e-8)
@@ -309,6 +315,16 @@ def rivals(
             yield name, base, predictor, time.process_time() - start, net.weights
 
 
+def with_images(samples: Sample, group: SymmetryGroup) -> Sample:
+    """Return samples followed by their images under the symmetries of a body."""
+    members = range(max(1, len(group)))
+    fields = (
+        torch.cat([group.images(field, torch.full((len(field),), k)) for k in members])
+        for field in samples[:2]
+    )
+    return Sample(*fields, *(torch.cat([column] * len(members)) for column in samples[2:]))
+
+
 def own(
     scene: Scene, names: Sequence[str], loads: int, folder: Path, seconds: float
 ) -> Iterator[tuple[str, str, Predictor, float, int]]:
@@ -340,15 +356,15 @@ def measured(
             errors.update(torch.cat([predictor(load) for load in samples.load.unbatch()]), samples)
             found[title] = {key: float(value) for key, value in errors.compute().items()}
     time_of = latency(predictor, sets["in range"].load.unbatch(), repeats=3)
-    numbers = [
-        found[title][f"rel_L2_{which}"]
+    others = {
+        f"{title}_{which}": found[title][f"rel_L2_{which}"]
         for title in ("small", "twice")
         for which in ("median", "worst")
-    ]
+    }
     test = found["in range"]
     return Row(
         name, base, loads, test["rel_L2_median"], test["rel_L2_worst"], test["e_mean"],
-        test["SNR_min"], *numbers, time_of.p50, seconds, weights,
+        test["SNR_min"], **others, ms=time_of.p50, fit_seconds=seconds, weights=weights,
     )  # fmt: skip
 
 
@@ -402,7 +418,7 @@ def main(cfg: DictConfig) -> None:
     def rows() -> Iterator[Row]:
         yield measured(linear_solution(scene), 0, sets)
         for loads in cfg.counts:
-            some = first(train, loads)
+            some = with_images(first(train, loads), data.group)
             for method in rivals(scene, some, held, cfg.rivals, cfg.seconds):
                 yield measured(method, loads, sets)
             for method in own(scene, cfg.models, loads, folder / "runs", cfg.seconds):

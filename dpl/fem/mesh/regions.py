@@ -28,7 +28,7 @@ class Plane:
     """
 
     axis: int = option("", least=0, most=2)
-    at: float | str
+    at: float | str  # type: ignore[misc]  # `option` has no default
 
     def __post_init__(self) -> None:
         check_options(self)
