@@ -12,6 +12,7 @@ KEYS = (
     (int, "count", 1, 10**6),
     (int, "seed", 0, 10**9),
     (int, "amplitudes", 1, 10**4),
+    (int, "hands", 1, 10**4),
 )
 
 
@@ -38,8 +39,13 @@ def main(cfg: DictConfig) -> None:
     with one_thread():
         rows, unknown = grasps.measure(gripper, every, say)
         amplitudes = grasps.against_amplitude(gripper, every[: cfg.amplitudes])
+        hands = [
+            grasps.moving_hand(surrogate, every[: cfg.hands], budget, MAX_STEPS)
+            for budget in grasps.BUDGETS
+        ]
     title = f"{cfg.count - unknown} random grasps, 1 thread"
     record(rows, stem, title)
+    record(hands, stem.with_name(f"{cfg.name}_hand"), f"{cfg.hands} grasps as motions of a hand")
     record(amplitudes, stem.with_name(f"{cfg.name}_amplitude"), None, grasps.draw)
     print(f"without a solution by Newton's method from rest, left out: {unknown}")
     print(f"slope of the error of the network in the amplitude: {grasps.slope(amplitudes):.2f}")
