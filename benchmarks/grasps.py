@@ -26,7 +26,6 @@ HALVINGS = 6  # of the amplitude of the grasps whose errors are drawn against it
 MET = 1e-3  # distance of a node from its prescribed place that counts as met [-]
 WRONG = 0.01  # relative error of a displacement from which it must be reported [-]
 REPORTED = 1 / 3  # smallest ratio of an estimated error to the error that counts as a report [-]
-FRAMES = 180  # of a hand, 3 s at 60 Hz
 CHECKED = 10  # frames from one to the next whose error is computed
 LATE = 1.2  # time over the budget that counts as late [-]
 BUDGETS = None, 5.0, 10.0, 14.0, 30.0  # of the frames of a hand [ms]
@@ -288,17 +287,25 @@ def _errors_of_prediction(raw: Gripper, grasp: Grasp) -> tuple[float, float, flo
 
 
 def moving_hand(
-    surrogate: TrainedSurrogate, grasps: Sequence[Grasp], budget_ms: float | None, steps: int
+    surrogate: TrainedSurrogate,
+    grasps: Sequence[Grasp],
+    budget_ms: float | None,
+    *,
+    steps: int,
+    frames: int,
 ) -> Hand:
-    """Return times and errors of a hand that makes each grasp in `FRAMES` equal frames.
+    """Return times and errors of a hand that makes each grasp in equal frames.
 
     Each grasp has a new gripper, so that its first frame prepares the patch.
     """
-    scene, first, times, errors = surrogate.scene, [], [], []
+    scene = surrogate.scene
+    first: list[float] = []
+    times: list[float] = []
+    errors: list[float] = []
     for grasp in grasps:
         gripper = Gripper(surrogate, steps=steps)
-        for k in range(1, FRAMES + 1):
-            part = grasp.scaled(k / FRAMES)
+        for k in range(1, frames + 1):
+            part = grasp.scaled(k / frames)
             motion = part.region, part.translation, part.rotation
             begin = time.perf_counter()
             answer = gripper(*motion, budget_ms=budget_ms, warm=True)
@@ -308,6 +315,7 @@ def moving_hand(
                 if (known := references(scene, patch, part)) is not None:
                     u, exact = answer.displacement / scene.length, known[-1].displacement.numpy()
                     errors.append(float(np.linalg.norm(u - exact) / np.linalg.norm(exact)))
+    errors = errors or [math.nan]  # no reference solution
     late = np.array([*first, *times]) > LATE * (budget_ms or math.inf)
     p50, p99 = np.quantile(times, [0.5, 0.99]).tolist()
     count, worst = len(first) + len(times), max(errors)

@@ -13,6 +13,7 @@ KEYS = (
     (int, "seed", 0, 10**9),
     (int, "amplitudes", 1, 10**4),
     (int, "hands", 1, 10**4),
+    (int, "frames", 10, 10**6),
 )
 
 
@@ -40,7 +41,9 @@ def main(cfg: DictConfig) -> None:
         rows, unknown = grasps.measure(gripper, every, say)
         amplitudes = grasps.against_amplitude(gripper, every[: cfg.amplitudes])
         hands = [
-            grasps.moving_hand(surrogate, every[: cfg.hands], budget, MAX_STEPS)
+            grasps.moving_hand(
+                surrogate, every[: cfg.hands], budget, steps=MAX_STEPS, frames=cfg.frames
+            )
             for budget in grasps.BUDGETS
         ]
     title = f"{cfg.count - unknown} random grasps, 1 thread"

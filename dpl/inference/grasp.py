@@ -33,7 +33,7 @@ LARGEST_MOTION = 1e6  # largest translation over L [-] and rotation [rad]
 LEAST_MOTION = 1e-280  # smaller ones count as zero: their residuals cannot be computed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class GraspAnswer(Answer):
     """Displacement of a body with a grasped patch, and the forces of the gripper, as NumPy arrays.
 
@@ -208,10 +208,14 @@ class Gripper:
 
     def _is_prepared(self, patch: RigidPatch, request: Request) -> bool:
         """Prepare a patch as far as the budget allows; return True if the call can go on."""
-        while not patch.is_prepared:
-            with request.durations.timed("preparation"):
-                patch.prepare(one=request.budget_ms is not None)
-            if request.over("state" if patch.is_prepared else "preparation"):
+        while missing := patch.missing_rows:
+            each = self._durations.forecast("row") or math.inf
+            one = missing * each > request.seconds_left
+            begin = time.perf_counter()
+            patch.prepare(one=one)
+            if one:
+                self._durations.add("row", time.perf_counter() - begin)
+            if request.over("row" if patch.missing_rows else "state"):
                 return False
         return True
 
@@ -265,11 +269,12 @@ class Gripper:
             body = end
             if k < parts:
                 body = self._held(end.patch, start.motion + (k / parts) * change, load, request)
-            best = body.corrected(end.patch.moved(field, body.goal), self.steps, request)
-            if best is None or (k < parts and request.over("step", "errors")):
+            found = body.corrected(end.patch.moved(field, body.goal), self.steps, request)
+            if found is None or (k < parts and request.over("step", "errors")):
                 return None
-            field, count = best.state.displacement[0], count + int(best.state.iterations)
-        return best._replace(state=best.state._replace(iterations=torch.tensor([count])))
+            field, count = found.state.displacement[0], count + int(found.state.iterations)
+            best = found._replace(state=found.state._replace(iterations=torch.tensor([count])))
+        return best
 
     def _predicted(
         self, body: HeldBody, load: Load, start: Grip, request: Request

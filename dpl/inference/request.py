@@ -20,7 +20,7 @@ from dpl.scene import Scene
 EXACT = 1e-12  # error of a motion that counts as met exactly [-]
 SUFFICIENT = 2e-3  # estimated relative error above which predictions are corrected [-]
 FINISH = "finish"  # stage between the last iteration of a call and its answer
-RECENT = 20  # times of a stage whose largest one is the forecast of the next
+RECENT = 20  # times of a stage from which the next one is forecast
 DECAY = 0.9  # of a forecast that prevents its stage, so that one slow call does not for ever
 
 
@@ -99,8 +99,8 @@ class Candidate(NamedTuple):
 class Durations:
     """Wall times of the stages of earlier calls, which forecast the next time of each stage.
 
-    The forecast is the largest of the last `RECENT` times: 19 of 20 further times are below it if
-    they are drawn from the same distribution.
+    The forecast is the second largest of the last `RECENT` times, of fewer times the largest: nine
+    of ten further times are below it if they are drawn from the same distribution.
     """
 
     def __init__(self) -> None:
@@ -120,7 +120,8 @@ class Durations:
 
     def forecast(self, stage: str) -> float:
         """Return the time of the next run of a stage [s]."""
-        return max(self._recent[stage], default=0.0)
+        times = sorted(self._recent[stage])
+        return times[-2 if len(times) == RECENT else -1] if times else 0.0
 
 
 @dataclass
@@ -223,6 +224,11 @@ class Request:
         """Time since the computation began [ms]."""
         return 1e3 * (time.perf_counter() - self.begin)
 
+    @property
+    def seconds_left(self) -> float:
+        """Time until the budget is spent [s]; infinite without one."""
+        return math.inf if self.budget_ms is None else (self.budget_ms - self.milliseconds) / 1e3
+
     def over(self, *stages: str) -> bool:
         """Return True if the next stages and the end of the call exceed the budget.
 
@@ -230,8 +236,7 @@ class Request:
         """
         if self.budget_ms is None:
             return False
-        ahead = sum(map(self.durations.forecast, (*stages, FINISH)))
-        is_over = self.milliseconds + 1e3 * ahead > self.budget_ms
+        is_over = sum(map(self.durations.forecast, (*stages, FINISH))) > self.seconds_left
         if is_over:
             self.durations.add(stages[0], DECAY * self.durations.forecast(stages[0]))
         self.spent |= is_over

@@ -113,8 +113,8 @@ class Simulator:
                 `{"poisson": 0.4}`; or all as an array (B, P).
             tol: Relative residual of the result [-], at least 1e-15 and below 1; with `error`, both
                 are met.
-            budget_ms: Wall time of each load [ms]. An iteration is not started if the largest time
-                of the last ones exceeds the rest of the budget, see `Durations`.
+            budget_ms: Wall time of each load [ms]. An iteration is not started if its forecast by
+                `Durations` exceeds the rest of the budget.
             error: Estimated relative error of the result [-]. The prediction of a model with modes
                 is corrected first, by at most `steps` steps, while its error is above `error`, or
                 above 2e-3 if `error` is left out.

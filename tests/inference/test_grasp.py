@@ -179,15 +179,6 @@ def test_a_correction_reduces_the_error_and_meets_the_motion(scene, solved, sim)
     assert better.error < raw.error
 
 
-def test_errors_of_a_linear_network_have_slope_two(scene):
-    network, errors = simulator_of(scene, linear_network(scene), steps=0), []
-    for part in (1e-2, 1e-3):
-        motion = [part * x for x in TRANSLATION], [part * x for x in ROTATION]
-        exact = network.grasp(END, *motion, tol=1e-9).displacement
-        errors.append(np.linalg.norm(network.grasp(END, *motion).displacement - exact))
-    assert math.log10(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
-
-
 @pytest.mark.parametrize(("size", "tol"), [(1e-300, 1e-6), (1e-30, None), (1e-12, 1e-6)])
 def test_a_tiny_motion_has_the_linear_answer_and_a_vanishing_one_has_rest(scene, sim, size, tol):
     motion = [[size * x for x in vector] for vector in (TRANSLATION, ROTATION)]

@@ -135,13 +135,13 @@ class RigidPatch:
         return field.reshape(-1)[self._dofs]
 
     @property
-    def is_prepared(self) -> bool:
-        """True if all rows of the compliance are computed."""
-        return sum(map(len, self._rows)) == len(self._dofs)
+    def missing_rows(self) -> int:
+        """Number of rows of the compliance that are not computed."""
+        return len(self._dofs) - sum(map(len, self._rows))
 
     def prepare(self, *, one: bool = False) -> None:
         """Compute the rows of the compliance that are left, or the next one."""
-        dofs, free = self._dofs[sum(map(len, self._rows)) :], self.problem.free
+        dofs, free = self._dofs[len(self._dofs) - self.missing_rows :], self.problem.free
         dofs = dofs[:1] if one else dofs
         units = torch.zeros(len(dofs), self.held.numel(), dtype=torch.float64)
         units[torch.arange(len(dofs)), dofs] = 1.0
@@ -158,7 +158,7 @@ class RigidPatch:
     @cached_property
     def compliance_factor(self) -> Tensor:
         """Cholesky factor of the linear displacements of the patch by forces on it, (m, m)."""
-        if not self.is_prepared:
+        if self.missing_rows:
             self.prepare()
         compliance = torch.cat(self._rows)
         return torch.linalg.cholesky((compliance + compliance.mT) / 2)
