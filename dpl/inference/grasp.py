@@ -389,7 +389,7 @@ class Gripper:
         if request.spent:
             words += f"; stopped by the budget of {request.budget_ms:g} ms"
         missed = held.motion_error * scene.length
-        return GraspAnswer(
+        return GraspAnswer(  # type: ignore[misc]  # mypy does not know the length of `fields`
             displacement.numpy(),
             *fields,
             f"motion error {missed:.1e} m; {words}",
