@@ -186,13 +186,15 @@ class Gripper:
                 if best.known_error <= ACCURATE or request.over("state", "errors"):
                     break
             assert best is not None
+            reached = best  # also with a tolerance, so that a hand does not depend on comparisons
             if request.tol is not None and not best.is_exact and not request.over("Newton"):
                 solved = body.equilibrium(best.state.displacement, request)
                 solved = body.with_errors(solved, request)
                 best = min(best, solved, key=lambda one: (not one.is_exact, one.known_error))
             with self._durations.timed(FINISH):
-                if (request.spent or best.known_error <= UNRELIABLE) and best.force is not None:
-                    self._last = Grip(patch, motion, best.force, best.state.displacement[0])
+                is_near = request.spent or reached.known_error <= UNRELIABLE
+                if is_near and reached.force is not None:
+                    self._last = Grip(patch, motion, reached.force, reached.state.displacement[0])
                 return self._reported(body, load, best, request, found=found)
 
     def _at_rest(
