@@ -24,6 +24,7 @@ from dpl.fem import Load, RigidPatch, Sphere
 from dpl.inference import Gripper
 from dpl.models.unrolled.correction import MAX_STEPS
 from dpl.system.threads import one_thread
+from dpl.training import TrainedSurrogate
 
 RADII = 0.05, 0.15  # smallest and largest radius of a patch over L [-]
 LOADS = 32  # training loads whose largest energy is that of the largest grasp
@@ -33,6 +34,9 @@ HALVINGS = 6  # of the amplitude of the grasps whose errors are drawn against it
 MET = 1e-3  # distance of a node from its prescribed place that counts as met [-]
 WRONG = 0.01  # relative error of a displacement from which it must be reported [-]
 REPORTED = 1 / 3  # smallest ratio of an estimated error to the error that counts as a report [-]
+CHECKED = 10  # frames from one to the next whose error is computed
+LATE = 1.2  # time over the budget that counts as late [-]
+BUDGETS = None, 5.0, 10.0, 14.0, 30.0  # of the frames of a hand [ms]
 NEWTON = "Newton from rest to 1e-6"
 TOL = 1e-6  # relative residual of the methods that iterate to a tolerance [-]
 REFERENCE_TOL = 1e-9  # relative residual of the solutions that errors are relative to [-]
@@ -89,6 +93,21 @@ class Amplitude:
     # [-]
     error: float
     linear: float  # the same of the linear solution
+
+
+@dataclass(frozen=True)
+class Hand:
+    """Times and errors of the frames of a hand that makes the motion of a grasp."""
+
+    budget_ms: float | None  # wall time of a frame [ms]; None: no budget
+    frames: int  # number of frames
+    first_ms: float  # time of the first frame, which prepares the patch [ms]
+    p50_ms: float  # times of the others [ms]
+    p99_ms: float
+    late: float  # part of the frames that take more than `LATE` times the budget [%]
+    # rel_L2_median, rel_L2_worst: relative L2 errors of every `CHECKED`th displacement [-]
+    rel_L2_median: float
+    rel_L2_worst: float
 
 
 def random_grasps(scene: Scene, count: int, seed: int = 0) -> Iterator[Grasp]:
@@ -275,6 +294,44 @@ def _errors_of_prediction(raw: Gripper, grasp: Grasp) -> tuple[float, float, flo
     return float((u - exact).norm()), float((linear - exact).norm()), float(exact.norm())
 
 
+def moving_hand(
+    surrogate: TrainedSurrogate,
+    grasps: Sequence[Grasp],
+    budget_ms: float | None,
+    *,
+    steps: int,
+    frames: int,
+) -> Hand:
+    """Return times and errors of a hand that makes each grasp in equal frames.
+
+    Each grasp has a new gripper, so that its first frame prepares the patch.
+    """
+    scene = surrogate.scene
+    first: list[float] = []
+    times: list[float] = []
+    errors: list[float] = []
+    for grasp in grasps:
+        gripper = Gripper(surrogate, steps=steps)
+        for k in range(1, frames + 1):
+            part = grasp.scaled(k / frames)
+            motion = part.region, part.translation, part.rotation
+            begin = time.perf_counter()
+            answer = gripper(*motion, budget_ms=budget_ms, warm=True)
+            (times if k > 1 else first).append(1e3 * (time.perf_counter() - begin))
+            if k % CHECKED == 0:
+                patch = gripper.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
+                if (known := references(scene, patch, part)) is not None:
+                    u, exact = answer.displacement / scene.length, known[-1].displacement.numpy()
+                    errors.append(float(np.linalg.norm(u - exact) / np.linalg.norm(exact)))
+    errors = errors or [math.nan]  # no reference solution
+    late = np.array([*first, *times]) > LATE * (budget_ms or math.inf)
+    p50, p99 = np.quantile(times, [0.5, 0.99]).tolist()
+    count, worst = len(first) + len(times), max(errors)
+    return Hand(
+        budget_ms, count, median(first), p50, p99, 100 * float(late.mean()), median(errors), worst
+    )
+
+
 def slope(rows: Sequence[Amplitude]) -> float:
     """Return the slope of the errors of predictions against the amplitude, both logarithmic."""
     x, y = np.log([[row.amplitude, row.error] for row in rows]).T
@@ -300,6 +357,8 @@ KEYS = (
     (int, "count", 1, 10**6),
     (int, "seed", 0, 10**9),
     (int, "amplitudes", 1, 10**4),
+    (int, "hands", 1, 10**4),
+    (int, "frames", 10, 10**6),
 )
 
 
@@ -319,6 +378,12 @@ def main(cfg: DictConfig) -> None:
     with one_thread():
         rows, unknown = measure(gripper, every, say)
         amplitudes = against_amplitude(gripper, every[: cfg.amplitudes])
+        some = every[: cfg.hands]
+        hands = [
+            moving_hand(surrogate, some, budget, steps=MAX_STEPS, frames=cfg.frames)
+            for budget in BUDGETS
+        ]
+    record(hands, stem.with_name(f"{cfg.name}_hand"), f"{cfg.hands} grasps as motions of a hand")
     record(rows, stem, f"{cfg.count - unknown} random grasps, 1 thread")
     record(amplitudes, stem.with_name(f"{cfg.name}_amplitude"), None, draw)
     print(f"without a solution by Newton's method from rest, left out: {unknown}")

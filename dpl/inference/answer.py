@@ -10,6 +10,8 @@ import torch
 
 from dpl.fem import Solution, Status
 from dpl.fem.loads.family import MAX_DISTANCE
+from dpl.inference.request import Candidate, Request
+from dpl.scene import Scene
 
 ROUNDOFF = 1e-9  # relative error of amplitudes [-]
 UNRELIABLE = 0.1  # estimated error from which a grasp is reported [-]
@@ -59,6 +61,21 @@ class Answer:
     iterations: Any
     milliseconds: Any
     summary: Any
+
+
+def fields_of(
+    best: Candidate, place: tuple[float, float, bool], request: Request, scene: Scene
+) -> tuple[Any, ...]:
+    """Return the fields of `Answer` for one solution; `place` is its `RangeCheck`."""
+    state, error = best.state, best.known_error
+    residual, converged = float(state.residual), best.is_exact
+    kept = converged and residual < request.residual_tol(scene)
+    rest = best.method == "rest" and converged
+    words = "no load: at rest" if rest else summarise(state, kept, error, *place)
+    displacement = scene.length * state.displacement[0]
+    numbers = residual, error, float(state.volume_ratio), kept, int(state.negative_pivots)
+    counts = best.method, int(state.iterations), request.milliseconds
+    return (displacement, *numbers, *place, *counts, words)
 
 
 def summarise(

@@ -3,204 +3,97 @@
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dpl.fem import (
-    AndersonSolver,
-    Load,
-    Newton,
-    RigidPatch,
-    Solution,
-    estimate_error,
-    evaluate_solution,
-)
-from dpl.inference.answer import UNRELIABLE, relative, summarise
+from dpl.fem import Load, RigidPatch, evaluate_solution
+from dpl.inference.answer import UNRELIABLE, Answer, fields_of, relative
 from dpl.inference.arguments import as_load, as_numbers
-from dpl.inference.grasp_forces import Forces, predicted_forces
-from dpl.inference.hybrid import Hybrid
-from dpl.inference.request import Candidate, Request
+from dpl.inference.held_body import MAX_ITER, MOTION_TOL, HeldBody, predicted_forces
+from dpl.inference.request import FINISH, Candidate, Durations, Request
 from dpl.inference.training_range import RangeCheck
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import TrainedSurrogate
 
-CORRECTED = 3e-4  # change of a displacement below which its correction ends, over its norm [-]
+CORRECTED_GAP = 1e-2  # error of a motion at which its prediction is corrected, over its size [-]
+CORRECTED_ITER = 3  # predictions for a motion if the last one is corrected
+ACCURATE = 1e-2  # estimated error from which a motion is made in more parts [-]
+PARTS = 1, 2, 4, 8  # factors on the number of parts, which follow each other
+MAX_PARTS = 32  # smallest number of parts of the largest rotations
+MAX_TURN = math.radians(30)  # largest rotation of a part of a motion [rad]
+MAX_PREDICTED_TURN = math.radians(60.1)  # largest rotation that is predicted [rad]
 MAX_PATCHES = 2  # patches whose compliance and held body are kept
 LARGEST_MOTION = 1e6  # largest translation over L [-] and rotation [rad]
 LEAST_MOTION = 1e-280  # smaller ones count as zero: their residuals cannot be computed
 
 
-@dataclass(frozen=True)
-class GraspAnswer:
-    """Displacement of a body with a grasped patch, and the forces of the gripper.
+@dataclass(frozen=True, kw_only=True)
+class GraspAnswer(Answer):
+    """Displacement of a body with a grasped patch, and the forces of the gripper, as NumPy arrays.
+
+    The fields of `Answer` have these meanings:
+
+    - `residual` is that of all nodes that are not held; the forces of the gripper count as load.
+    - `error` is the estimated error of the held body plus `motion_error` over the largest
+      displacement: no bound. Where the budget leaves no time for the estimate, it is that of the
+      last correction, or infinite.
+    - `converged` requires that the motion is met exactly, too.
+    - `amplitude` and `out_of_span` are those of the forces of the gripper. A rigid patch has
+      concentrated forces along its edge, which most trainings do not contain. A grasp is therefore
+      `out_of_distribution` only if `error` is not below 10 %, too.
+    - `method` is "prediction", "corrected", "hybrid" or "full Newton"; "rest" while the budgets of
+      the calls have not sufficed to prepare the patch.
+    - `iterations` counts predictions, corrections and linear solves of Newton's method.
 
     Attributes:
-        displacement: (N, D) [m], a NumPy array.
         force: Resultant of the forces of the gripper on the body, (D,) [N] (2D: [N/m]).
         moment: Their moment about the centre of the displaced patch, (3,) [N m], in 2D (1,) [N].
         nodal_force: The forces of the gripper, (N, D) [N]; zero outside of the patch.
         motion_error: Largest distance of a held node from its prescribed place [m].
-        residual: Relative residual at all other nodes [-], see `Problem.relative_residual_of`; the
-            forces of the gripper count as load.
-        error: Estimated relative error of the displacement [-], see `estimate_error`, plus
-            `motion_error` over the largest displacement of the body: no bound.
         force_error, moment_error: Estimated errors of `force` and `moment` over their norms [-],
             see `HeldBody.wrench_errors`: no bounds. They can be far larger than `error`. They are
             infinite if `error` is, and large where symmetry makes a resultant zero.
-        volume_ratio: min det F [-]; an element is inverted if it is not above 0.
-        converged: True if the motion is met exactly, the residual is below the tolerance and no
-            element is inverted.
-        amplitude, out_of_span: Position of the forces of the gripper relative to the training, see
-            `Answer`. A rigid patch has concentrated forces along its edge, which most trainings do
-            not contain.
-        out_of_distribution: True if the forces are outside the training range and `error` is not
-            below 10 %.
-        method: "prediction", "corrected", "hybrid" or "full Newton".
-        iterations: Predictions of the network and corrections, or linear solves of Newton's method.
-        milliseconds: Wall time [ms].
-        forces_found: True if the network predicts the motion under forces that were found. False:
-            the linear displacement closes the gap of the nearest prediction.
-        stopped: True if the budget ended the search for the forces, the correction or Newton's
-            method.
-        summary: Motion, estimated error, residual and range in words.
+        forces_found: True if the network predicts the motion under forces that were found, or if
+            the state of the last call was continued. False: the linear displacement closes the gap
+            of the nearest prediction, or the motion was made in parts.
+        stopped: True if the budget ended the preparation of the patch, the search for the forces,
+            the correction, the estimate of the error or Newton's method.
     """
 
-    displacement: Any
     force: Any
     moment: Any
     nodal_force: Any
     motion_error: float
-    residual: float
-    error: float
     force_error: float
     moment_error: float
-    volume_ratio: float
-    converged: bool
-    amplitude: float
-    out_of_span: float
-    out_of_distribution: bool
-    method: str
-    iterations: int
-    milliseconds: float
     forces_found: bool
     stopped: bool
-    summary: str
 
 
-@dataclass(frozen=True, eq=False)
-class HeldBody:
-    """A body whose patch is held at its goal.
+class Grip(NamedTuple):
+    """A state of a grasped body, from which the next motion of its patch starts.
 
     Attributes:
         patch: The patch.
-        goal: Its displacement, (m,) [-].
-        load: Other forces on the body, B = 1, without parameters of the law.
-        newton: Newton's method with the patch as a moved support.
+        motion: Its translation over L [-] and rotation vector [rad].
+        force: Forces of the gripper at held degrees of freedom, (m,) [-].
+        field: Displacement, (N, D) [-].
     """
 
     patch: RigidPatch
-    goal: Tensor
-    load: Load
-    newton: Newton
-
-    def with_errors(self, candidate: Candidate) -> Candidate:
-        """Return a candidate with the forces of the gripper, its motion and estimated errors."""
-        patch, u = self.patch, candidate.state.displacement
-        evaluation = self.newton.problem.evaluate(u)
-        missed = float(patch.at(self.goal - patch.of_field(u[0])).norm(dim=1).max())
-        found = estimate_error(self.newton.linear_solver, self.load, u, evaluation)
-        force = candidate.force
-        if force is None:
-            force = patch.of_field(evaluation.internal[0] - self.load.force[0])
-        return candidate._replace(
-            state=candidate.state.unstable() if found.is_indefinite else candidate.state,
-            force=force,
-            motion_error=missed,
-            error=found.error + missed / max(float(u.norm(dim=2).max()), 1e-300),
-            correction=found.correction,
-        )
-
-    def wrench_errors(self, candidate: Candidate) -> tuple[float, float]:
-        """Return the estimated relative errors of force and moment of the gripper [-].
-
-        The estimates compare them with those of the corrected displacement: the correction behind
-        the estimated error of the displacement is added, and the linear forces that move the patch
-        to its goal. They cost one residual.
-        """
-        if candidate.correction is None:
-            return math.inf, math.inf
-        patch, u = self.patch, candidate.state.displacement
-        better = u + candidate.correction
-        reaction = self.newton.problem.evaluate(better).internal - self.load.force
-        moved = patch.stiffness_times(self.goal - patch.of_field(u[0]))
-        expected = patch.wrench(patch.at(patch.of_field(reaction[0]) + moved), better[0])
-        assert candidate.force is not None
-        found = patch.wrench(patch.at(candidate.force), u[0])
-        pairs = zip(found, expected, strict=True)
-        sizes = [(float((a - b).norm()), float(a.norm())) for a, b in pairs]
-        force, moment = (e / max(size, 1e-300) if e >= 0 else math.inf for e, size in sizes)
-        return force, moment
-
-    def candidates(self, forces: Forces, steps: int, request: Request) -> Iterator[Candidate]:
-        """Yield the prediction under the forces, corrected if possible, and the equilibrium.
-
-        The equilibrium is that of Newton's method from the corrected prediction, or from rest where
-        that does not lead to a solution.
-
-        Args:
-            forces: Forces of the gripper by the network.
-            steps: Largest number of iterations of the correction; 0: the prediction is not
-                corrected.
-            request: Its budget ends correction and Newton's method; their last states are yielded.
-        """
-        newton, field, count = self.newton, forces.field, forces.predictions
-        guess = torch.where(newton.problem.free, field, newton.problem.prescribed)[None]
-        best = self._corrected(guess, steps, request) if steps else None
-        if best is None:
-            state = evaluate_solution(
-                newton.problem, field[None], self.load, newton.tol, from_guess=True
-            )
-            state = state._replace(iterations=state.iterations + count)
-            yield Candidate("prediction", state, force=forces.force)
-        else:
-            guess = best.displacement
-            yield Candidate("corrected", best._replace(iterations=best.iterations + count))
-        clock = time.perf_counter()
-        for last in Hybrid(lambda load: guess, newton).iterate(self.load):
-            now = time.perf_counter()
-            pace, clock = now - clock, now
-            if not last.converged and request.over(pace):
-                break
-        yield Candidate("hybrid" if bool(last.from_guess) else "full Newton", last)
-
-    def _corrected(self, guess: Tensor, steps: int, request: Request) -> Solution | None:
-        """Return the iterate of least residual from a guess (1, N, D); None if that is inverted.
-
-        Iterations with the corotated factor of K(0) end when the displacement changes by less than
-        `CORRECTED`.
-        """
-        valid: list[Solution] = []
-        for state in AndersonSolver(self.newton, max_iter=steps).iterate(self.load, guess=guess):
-            if not bool(state.volume_ratio > 0):
-                break
-            valid.append(state)
-            last = [one.displacement for one in valid[-2:]]
-            if len(valid) > 1 and (last[1] - last[0]).norm() < CORRECTED * last[1].norm():
-                break
-            if len(valid) <= steps and request.over():
-                break
-        return min(valid, key=lambda one: float(one.residual), default=None)
+    motion: Tensor
+    force: Tensor
+    field: Tensor
 
 
 class Gripper:
-    """Grasps of a body, with the last patches and the forces of the last grasp.
+    """Grasps of a body, with the last patches and the state of the last grasp.
 
     Attributes:
         surrogate: The surrogate that predicts displacements.
@@ -211,7 +104,8 @@ class Gripper:
         """Store the surrogate; a patch is prepared when it is grasped for the first time."""
         self.surrogate, self.steps = surrogate, steps
         self._patches: OrderedDict[bytes, RigidPatch] = OrderedDict()
-        self._last: tuple[RigidPatch, Tensor] | None = None
+        self._last: Grip | None = None
+        self._durations = Durations()
 
     @property
     def scene(self) -> Scene:
@@ -235,8 +129,10 @@ class Gripper:
         """Return the displacement of the body while a gripper moves a patch of its boundary.
 
         The nodes of the patch move as a rigid body. The forces of the gripper are found through
-        predictions of the network, see `predicted_forces`. With a tolerance, Newton's method solves
-        the equilibrium of the body with the patch as a moved support, from this prediction.
+        predictions of the network, see `predicted_forces`; the prediction is corrected, see
+        `HeldBody.corrected`. Large rotations, and motions whose correction is not near equilibrium,
+        are made in parts from rest, each of which is corrected. With a tolerance, Newton's method
+        solves the equilibrium of the body with the patch as a moved support, from this state.
 
         Args:
             region: The patch: a region of `dpl.fem` in the coordinates of the mesh, or a mask of
@@ -249,10 +145,12 @@ class Gripper:
                 left out.
             young: Young's modulus [Pa]; optional if the scene has only one.
             parameters: A value for each range of the law, by its name or as an array (P,).
-            tol: Relative residual of the result [-]; None: the prediction of the network.
-            budget_ms: Wall time [ms]. No prediction is started after it, and no iteration of Newton
-                that would exceed it. A new patch is prepared and one prediction made in any case.
-            warm: Begin with the forces of the last call if it grasped the same patch.
+            tol: Relative residual of the result [-]; None: the corrected prediction.
+            budget_ms: Wall time [ms]. No prediction, correction and iteration is started that would
+                exceed it, see `Durations`. The body is at rest in the answer until a new patch is
+                prepared, for which each call uses its budget.
+            warm: Begin with the state of the last call if it grasped the same patch: the answer is
+                the last displacement, moved with the patch and corrected, if that is accurate.
             sliding: Hold the largest part of the patch that faces one way along a coordinate axis,
                 along this axis alone, as a flat plate does that is lubricated and does not lift
                 off. Components of the motion across have no effect.
@@ -262,26 +160,158 @@ class Gripper:
                 is free to move, or a patch that slides faces no axis.
         """
         begin = time.perf_counter()
-        request = replace(Request.checked(tol, budget_ms, None, warm=warm), begin=begin)
+        request = replace(
+            Request.checked(tol, budget_ms, None, warm=warm),
+            begin=begin, durations=self._durations,
+        )  # fmt: skip
         load = self._load(force, young, parameters)
-        patch, path = self._patch(region, translation, rotation, load, sliding=sliding)
+        motion, directions = self._motion(translation, rotation)
+        patch = self.patch(region, directions, load.parameters, sliding=sliding)
         with one_thread(), torch.inference_mode():
-            newton = patch.newton(self.scene.corrector, path(1.0))
-            newton = newton if request.tol is None else replace(newton, tol=request.tol)
-            start = self._last[1] if warm and self._last and self._last[0] is patch else None
-            scale = self._motion_without(patch, load)
-            predict = partial(self._predict, load)
-            forces = predicted_forces(
-                patch, path, predict, start, scale=scale, is_over=request.over
+            last = self._last if warm and self._last and self._last.patch is patch else None
+            self._last = None
+            if not self._is_prepared(patch, request):
+                with self._durations.timed(FINISH):
+                    return self._at_rest(patch, motion, load, request)
+            body, found = self._held(patch, motion, load, request), False
+            best: Candidate | None = None
+            clock = time.perf_counter()
+            for candidate, is_found in self._states(body, motion, load, last, request):
+                now = time.perf_counter()
+                self._durations.add("state", now - clock)
+                clock = now
+                candidate = body.with_errors(candidate, request)
+                if best is None or candidate.known_error < best.known_error:
+                    best, found = candidate, is_found
+                if best.known_error <= ACCURATE or request.over("state", "errors"):
+                    break
+            assert best is not None
+            reached = best  # also with a tolerance, so that a hand does not depend on comparisons
+            if request.tol is not None and not best.is_exact and not request.over("Newton"):
+                solved = body.equilibrium(best.state.displacement, request)
+                solved = body.with_errors(solved, request)
+                best = min(best, solved, key=lambda one: (not one.is_exact, one.known_error))
+            with self._durations.timed(FINISH):
+                is_near = request.spent or reached.known_error <= UNRELIABLE
+                if is_near and reached.force is not None:
+                    self._last = Grip(patch, motion, reached.force, reached.state.displacement[0])
+                return self._reported(body, load, best, request, found=found)
+
+    def _at_rest(
+        self, patch: RigidPatch, motion: Tensor, load: Load, request: Request
+    ) -> GraspAnswer:
+        """Return the body at rest as the answer of a patch that is not prepared."""
+        newton = self.scene.corrector.with_parameters(load.parameters)
+        goal = self._goal(patch, motion)
+        state = evaluate_solution(newton.problem, newton.problem.prescribed[None], load, newton.tol)
+        missed, force = float(patch.at(goal).norm(dim=1).max()), torch.zeros_like(goal)
+        best = Candidate("rest", state, math.inf, motion_error=missed, force=force)
+        return self._reported(HeldBody(patch, goal, load, newton), load, best, request, found=False)
+
+    def _is_prepared(self, patch: RigidPatch, request: Request) -> bool:
+        """Prepare a patch as far as the budget allows; return True if the call can go on."""
+        while missing := patch.missing_rows:
+            each = self._durations.forecast("row") or math.inf
+            one = missing * each > request.seconds_left
+            begin = time.perf_counter()
+            patch.prepare(one=one)
+            if one:
+                self._durations.add("row", time.perf_counter() - begin)
+            if request.over("row" if patch.missing_rows else "state"):
+                return False
+        return True
+
+    def _goal(self, patch: RigidPatch, motion: Tensor) -> Tensor:
+        """Return the displacement of the held degrees of freedom, (m,) [-], of a motion."""
+        dim = patch.held.shape[1]
+        return patch.displacement(motion[:dim].tolist(), motion[dim:].tolist())
+
+    def _held(self, patch: RigidPatch, motion: Tensor, load: Load, request: Request) -> HeldBody:
+        """Return the body with a patch at a motion; its law has the parameters of the load."""
+        goal = self._goal(patch, motion)
+        newton = patch.newton(self.scene.corrector, goal)
+        newton = newton if request.tol is None else replace(newton, tol=request.tol)
+        return HeldBody(patch, goal, Load(load.force, load.young), newton)
+
+    def _states(
+        self, body: HeldBody, motion: Tensor, load: Load, last: Grip | None, request: Request
+    ) -> Iterator[tuple[Candidate, bool]]:
+        """Yield states at a motion, and whether the forces of the network were found.
+
+        They continue from the last state, from the prediction and, in parts, from rest. Large
+        rotations are not predicted unless nothing else leads to a state.
+        """
+        patch = body.patch
+        rest = Grip(patch, 0 * motion, 0 * body.goal, torch.zeros(patch.held.shape).double())
+        is_predicted = not self.steps or self._parts(motion) * MAX_TURN < MAX_PREDICTED_TURN
+        if last is not None and self.steps:
+            parts = self._parts(motion - last.motion)
+            if (state := self._in_parts(body, last, motion, parts, load, request)) is not None:
+                yield state, True
+        if is_predicted:
+            yield self._predicted(body, load, last or rest, request)
+        for doubled in PARTS if self.steps else ():
+            parts = doubled * self._parts(motion)
+            if (state := self._in_parts(body, rest, motion, parts, load, request)) is not None:
+                yield state, False
+        if not is_predicted:
+            yield self._predicted(body, load, rest, request)
+
+    def _parts(self, motion: Tensor) -> int:
+        """Return the number of parts with rotations of at most `MAX_TURN`, if they are not many."""
+        turn = float(motion[self.scene.problem.shape[1] :].norm())
+        return min(max(math.ceil(turn / MAX_TURN), 1), MAX_PARTS)
+
+    def _in_parts(
+        self, end: HeldBody, start: Grip, motion: Tensor, parts: int, load: Load, request: Request
+    ) -> Candidate | None:
+        """Return the state after a motion in equal parts; None if one is inverted or time is up."""
+        field, count, change = start.field, 0, motion - start.motion
+        for k in range(1, parts + 1):
+            body = end
+            if k < parts:
+                body = self._held(end.patch, start.motion + (k / parts) * change, load, request)
+            found = body.corrected(end.patch.moved(field, body.goal), self.steps, request)
+            if found is None or (k < parts and request.over("step", "errors")):
+                return None
+            field, count = found.state.displacement[0], count + int(found.state.iterations)
+            best = found._replace(state=found.state._replace(iterations=torch.tensor([count])))
+        return best
+
+    def _predicted(
+        self, body: HeldBody, load: Load, start: Grip, request: Request
+    ) -> tuple[Candidate, bool]:
+        """Return the corrected prediction, and whether its forces are found.
+
+        If they are not, the linear displacement that closes the gap of the patch is added to a
+        prediction that is not corrected, and the forces of this displacement to its forces.
+        """
+        patch, newton = body.patch, body.newton
+        begin = start.force + patch.stiffness_times(body.goal - body.patch.of_field(start.field))
+
+        def predict(own: Tensor) -> Tensor:
+            with request.durations.timed("prediction"):
+                return self.surrogate.predict(load._replace(force=load.force + own))[0]
+
+        tol, most = (CORRECTED_GAP, CORRECTED_ITER) if self.steps else (MOTION_TOL, MAX_ITER)
+        force, field, count, is_found = predicted_forces(
+            patch, body.goal, predict, begin, scale=self._motion_without(patch, load),
+            tol=tol, max_iter=most, is_over=lambda: request.over("prediction", "errors"),
+        )  # fmt: skip
+        best = None
+        if self.steps:
+            best = body.corrected(patch.moved(field, body.goal), self.steps, request)
+        if best is None:
+            if not is_found:
+                added = patch.stiffness_times(body.goal - patch.of_field(field))
+                field = field + patch.linear.solve_force(patch.at(added))
+                force = force + added
+            state = evaluate_solution(
+                newton.problem, field[None], body.load, newton.tol, from_guess=True
             )
-            self._last = patch, forces.force
-            # the body of Newton's method has the parameters
-            body = HeldBody(patch, path(1.0), Load(load.force, load.young), newton)
-            every = map(body.with_errors, body.candidates(forces, self.steps, request))
-            best = next(every)
-            if request.tol is not None and not best.is_exact and not request.over():
-                best = min(best, next(every), key=lambda one: (not one.is_exact, one.known_error))
-            return self._reported(body, load, best, request, found=forces.found)
+            best = Candidate("prediction", state, force=force)
+        state = best.state._replace(iterations=best.state.iterations + count)
+        return best._replace(state=state), is_found
 
     def _load(self, force: Any, young: Any, parameters: Any) -> Load:
         """Return the other forces on the body as a load, B = 1."""
@@ -298,32 +328,23 @@ class Gripper:
         modulus = scene.loads.moduli[0]  # by which the constant force is divided
         return load._replace(force=constant[None] * (modulus / load.young))
 
-    def _patch(
-        self, region: Any, translation: Any, rotation: Any, load: Load, *, sliding: bool
-    ) -> tuple[RigidPatch, Callable[[float], Tensor]]:
-        """Return the patch and the displacement (m,) [-] of its held degrees of freedom.
-
-        The latter is a function of the part of the motion in [0, 1].
-        """
-        scene, dim = self.scene, self.scene.problem.shape[1]
+    def _motion(self, translation: Any, rotation: Any) -> tuple[Tensor, list[bool]]:
+        """Return translation over L with rotation [rad], and the directions that are held."""
+        dim = self.scene.problem.shape[1]
         moves = list(translation)
         if len(moves) != dim:
             raise ValueError(f"translation = {moves} must be {dim} lengths [m], None where free")
         lengths = as_numbers("translation", [0.0 if x is None else x for x in moves])
         count = 3 if dim == 3 else 1
         turn = as_numbers("rotation", [0.0] * count if rotation is None else rotation).reshape(-1)
-        motion = torch.cat([lengths / scene.length, turn])
+        motion = torch.cat([lengths / self.scene.length, turn])
         if len(turn) != count or not (motion.abs() <= LARGEST_MOTION).all():
             raise ValueError(
                 f"translation = {moves}, rotation = {turn.tolist()} must be {dim} lengths [m] and "
                 f"{count} angles [rad], all finite and at most {LARGEST_MOTION:g} L and rad"
             )
         motion = motion.where(motion.abs() >= LEAST_MOTION, 0.0)
-        directions = [x is not None for x in moves]
-        patch = self.patch(region, directions, load.parameters, sliding=sliding)
-        return patch, lambda part: patch.displacement(
-            (part * motion[:dim]).tolist(), (part * motion[dim:]).tolist()
-        )
+        return motion, [x is not None for x in moves]
 
     def patch(
         self,
@@ -353,10 +374,6 @@ class Gripper:
         size = float(patch.of_field(self.surrogate.predict(load)[0]).abs().max())
         return size if math.isfinite(size) else 0.0
 
-    def _predict(self, load: Load, own: Tensor) -> Tensor:
-        """Return the displacement (N, D) [-] under a load and forces of the gripper (N, D) [-]."""
-        return self.surrogate.predict(load._replace(force=load.force + own))[0]
-
     def _reported(
         self, body: HeldBody, load: Load, held: Candidate, request: Request, *, found: bool
     ) -> GraspAnswer:
@@ -364,36 +381,26 @@ class Gripper:
         scene, state = self.scene, held.state
         unit = float(load.young) * scene.force_unit
         assert held.force is not None
-        nodal, error = body.patch.at(held.force), held.known_error
+        nodal = body.patch.at(held.force)
         wrench = body.patch.wrench(nodal, state.displacement[0])
         force_error, moment_error = body.wrench_errors(held)
         (place,) = RangeCheck.of(self.surrogate, load._replace(force=load.force + nodal))
-        amplitude, out_of_span, outside = place
-        outside = outside and not error < UNRELIABLE
-        words = summarise(state, held.is_exact, error, amplitude, out_of_span, outside)
+        place = place._replace(outside=place.outside and not held.known_error < UNRELIABLE)
+        displacement, *fields, words = fields_of(held, place, request, scene)
         words += f"; force within about {relative(force_error)}, moment {relative(moment_error)}"
         if request.spent:
             words += f"; stopped by the budget of {request.budget_ms:g} ms"
         missed = held.motion_error * scene.length
-        return GraspAnswer(
-            displacement=scene.length * state.displacement[0].numpy(),
+        return GraspAnswer(  # type: ignore[misc]  # mypy does not know the length of `fields`
+            displacement.numpy(),
+            *fields,
+            f"motion error {missed:.1e} m; {words}",
             force=unit * wrench.force.numpy(),
             moment=unit * scene.length * wrench.moment.numpy(),
             nodal_force=unit * nodal.numpy(),
             motion_error=missed,
-            residual=float(state.residual),
-            error=error,
             force_error=force_error,
             moment_error=moment_error,
-            volume_ratio=float(state.volume_ratio),
-            converged=held.is_exact,
-            amplitude=amplitude,
-            out_of_span=out_of_span,
-            out_of_distribution=outside,
-            method=held.method,
-            iterations=int(state.iterations),
-            milliseconds=1e3 * (time.perf_counter() - request.begin),
             forces_found=found,
             stopped=request.spent,
-            summary=f"motion error {missed:.1e} m; {words}",
         )

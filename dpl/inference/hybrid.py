@@ -101,7 +101,8 @@ class Hybrid:
     from zero. Unlike residuals, corrections do not depend on the stiffness of the body against an
     error.
 
-    With `steps`, Anderson iterations are made first; Newton continues from the best of them.
+    With `steps`, Anderson iterations are made first; Newton continues from the best of them unless
+    `is_over()` returns True.
 
     Source: Odot, Haferssas, Cotin (2022), DeepPhysics, algorithm 2; Deuflhard (2011), Newton
     Methods for Nonlinear Problems, section 3.2 (natural monotonicity).
@@ -111,12 +112,14 @@ class Hybrid:
         newton: Newton's method.
         rule: Criterion by which Newton continues from the prediction, one of `RULES`.
         steps: Iterations without tangents that precede Newton; None: no such iterations.
+        is_over: Called between these iterations and Newton; True: the iteration ends.
     """
 
     predict: Predict
     newton: Corrector
     rule: str = "natural_monotonicity"
     steps: AndersonSolver | None = None
+    is_over: Callable[[], bool] = bool  # which returns False
 
     def __post_init__(self) -> None:
         if self.rule not in RULES:
@@ -168,7 +171,7 @@ class Hybrid:
                 break
             yield state
             least = state if least is None or state.residual < least.residual else least
-        if state.converged:
+        if state.converged or self.is_over():
             return
         states = self._corrected(load, guess if least is None else least.displacement)
         if least is not None:

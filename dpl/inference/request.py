@@ -2,7 +2,10 @@
 
 import math
 import time
-from dataclasses import dataclass
+from collections import defaultdict, deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 from torch import Tensor
@@ -16,6 +19,9 @@ from dpl.scene import Scene
 
 EXACT = 1e-12  # error of a motion that counts as met exactly [-]
 SUFFICIENT = 2e-3  # estimated relative error above which predictions are corrected [-]
+FINISH = "finish"  # stage between the last iteration of a call and its answer
+RECENT = 20  # times of a stage from which the next one is forecast
+DECAY = 0.9  # of a forecast that prevents its stage, so that one slow call does not for ever
 
 
 class Guess(NamedTuple):
@@ -90,6 +96,34 @@ class Candidate(NamedTuple):
         return math.inf if self.error is None else self.error
 
 
+class Durations:
+    """Wall times of the stages of earlier calls, which forecast the next time of each stage.
+
+    The forecast is the second largest of the last `RECENT` times, of fewer times the largest: nine
+    of ten further times are below it if they are drawn from the same distribution.
+    """
+
+    def __init__(self) -> None:
+        """Begin without times; the forecast of a stage that was never timed is 0."""
+        self._recent: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RECENT))
+
+    def add(self, stage: str, seconds: float) -> None:
+        """Add a time of a stage [s]."""
+        self._recent[stage].append(seconds)
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the time of a block."""
+        begin = time.perf_counter()
+        yield
+        self.add(stage, time.perf_counter() - begin)
+
+    def forecast(self, stage: str) -> float:
+        """Return the time of the next run of a stage [s]."""
+        times = sorted(self._recent[stage])
+        return times[-2 if len(times) == RECENT else -1] if times else 0.0
+
+
 @dataclass
 class Request:
     """Tolerances and budget of a call.
@@ -101,6 +135,7 @@ class Request:
         warm: Whether the last displacement is a guess too.
         begin: Time at which the computation began [s].
         products: Largest number of products with the tangent in an estimated error.
+        durations: Times of the stages of this call and of earlier ones.
         spent: True if a computation ended because of the budget.
     """
 
@@ -110,6 +145,7 @@ class Request:
     warm: bool
     begin: float = 0.0
     products: int = PRODUCTS
+    durations: Durations = field(default_factory=Durations)
     spent: bool = False
 
     @classmethod
@@ -183,10 +219,25 @@ class Request:
         valid = bool(state.volume_ratio > 0)
         return not bool(state.converged), not valid, size if size == size else math.inf
 
-    def over(self, ahead: float = 0.0) -> bool:
-        """Return True if this time from now [s] exceeds the budget; the caller then ends."""
+    @property
+    def milliseconds(self) -> float:
+        """Time since the computation began [ms]."""
+        return 1e3 * (time.perf_counter() - self.begin)
+
+    @property
+    def seconds_left(self) -> float:
+        """Time until the budget is spent [s]; infinite without one."""
+        return math.inf if self.budget_ms is None else (self.budget_ms - self.milliseconds) / 1e3
+
+    def over(self, *stages: str) -> bool:
+        """Return True if the next stages and the end of the call exceed the budget.
+
+        The caller then ends. The forecast of the first of them decreases.
+        """
         if self.budget_ms is None:
             return False
-        is_over = 1e3 * (time.perf_counter() - self.begin + ahead) > self.budget_ms
+        is_over = sum(map(self.durations.forecast, (*stages, FINISH))) > self.seconds_left
+        if is_over:
+            self.durations.add(stages[0], DECAY * self.durations.forecast(stages[0]))
         self.spent |= is_over
         return is_over

@@ -2,10 +2,9 @@
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
@@ -20,11 +19,11 @@ from dpl.fem import (
     evaluate_solution,
 )
 from dpl.fem.solvers.error_estimate import MANY_PRODUCTS, PRODUCTS
-from dpl.inference.answer import Answer, answer_of, summarise
+from dpl.inference.answer import Answer, answer_of, fields_of
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.grasp import Gripper
 from dpl.inference.hybrid import default_hybrid
-from dpl.inference.request import Candidate, Guess, Request
+from dpl.inference.request import FINISH, Candidate, Durations, Guess, Request
 from dpl.inference.training_range import RangeCheck
 from dpl.models.unrolled.correction import MAX_STEPS
 from dpl.scene import Scene
@@ -33,7 +32,6 @@ from dpl.training import TrainedSurrogate
 
 ERROR = 1e-3  # estimated relative error in the modes at which the steps end [-]
 POOR_STREAM = 9_003  # of the loads by which the predictions are judged
-PACE_DECAY = 0.9  # of a time from call to call
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
 MAX_RESIDUAL = 1.0  # above it the error outside of the modes is not that of the training [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
@@ -81,9 +79,7 @@ class Simulator:
         if newton is not None:
             newton.tangent  # noqa: B018  # built here, so that the first call is not slower
         self._before: tuple[Tensor, Tensor] | None = None  # parameters, displacement
-        self._pace = 0.0  # time of the next iteration, as of the last one [s]
-        self._first_pace = 0.0  # time of the start of the hybrid and its first iteration [s]
-        self._estimate_time = 0.0  # time of an estimate of the error [s]
+        self._durations = Durations()
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
         self.scene.is_compact, self.scene.is_softened  # noqa: B018
         self.scene.linear.reference.corotational  # noqa: B018  # so is the factor of the estimate
@@ -117,8 +113,8 @@ class Simulator:
                 `{"poisson": 0.4}`; or all as an array (B, P).
             tol: Relative residual of the result [-], at least 1e-15 and below 1; with `error`, both
                 are met.
-            budget_ms: Wall time of each load [ms]. An iteration is not started if the time of the
-                last iteration exceeds the rest of the budget.
+            budget_ms: Wall time of each load [ms]. An iteration is not started if its forecast by
+                `Durations` exceeds the rest of the budget.
             error: Estimated relative error of the result [-]. The prediction of a model with modes
                 is corrected first, by at most `steps` steps, while its error is above `error`, or
                 above 2e-3 if `error` is left out.
@@ -133,7 +129,9 @@ class Simulator:
         begin = time.perf_counter()
         given = as_numbers("force", force)
         load = as_load(self.scene, given, young, parameters)
-        request = Request.checked(tol, budget_ms, error, warm=warm)
+        request = replace(
+            Request.checked(tol, budget_ms, error, warm=warm), durations=self._durations
+        )
         with one_thread(), torch.inference_mode():
             places = RangeCheck.of(self.surrogate, load)
             guesses: Sequence[Guess | None] = [None] * len(load.force)
@@ -145,11 +143,12 @@ class Simulator:
                 begin = time.perf_counter() - shared
                 own = replace(request, begin=begin, products=self._products(place, request))
                 best = self._solve(single, guess, place, own)
-                if stability:
-                    best = best._replace(state=self._with_stability(single, best.state))
-                self._before = single.parameters, best.state.displacement
-                taken = 1e3 * (time.perf_counter() - begin)
-                rows.append(self._row(best, place, request, taken))
+                with own.durations.timed(FINISH):
+                    best = self._with_error(single, best, own)
+                    if stability:
+                        best = best._replace(state=self._with_stability(single, best.state))
+                    self._before = single.parameters, best.state.displacement
+                    rows.append(fields_of(best, place, own, self.scene))
         return answer_of(rows, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
 
     def prediction_error(self, load: Load, prediction: Tensor) -> float:
@@ -178,25 +177,12 @@ class Simulator:
         rows = zip(predictions.split(1), errors.tolist(), places, strict=True)
         return [Guess(u, *own) if place.inside else Guess(u) for u, own, place in rows]
 
-    def _row(
-        self, best: Candidate, place: RangeCheck, request: Request, milliseconds: float
-    ) -> tuple[Any, ...]:
-        """Return the fields of `Answer` for one load."""
-        state, error = best.state, best.known_error
-        residual, converged = float(state.residual), bool(state.converged)
-        kept = converged and residual < request.residual_tol(self.scene)
-        words = "no load: at rest"
-        if best.method != "rest":
-            words = summarise(state, kept, error, *place)
-        displacement = self.scene.length * state.displacement[0]
-        numbers = residual, error, float(state.volume_ratio), kept, int(state.negative_pivots)
-        counts = best.method, int(state.iterations), milliseconds
-        return (displacement, *numbers, *place, *counts, words)
-
     def _solve(
         self, load: Load, guess: Guess | None, place: RangeCheck, request: Request
     ) -> Candidate:
         """Return the first solution that meets the tolerances, else the best one.
+
+        Its error is estimated if that decides.
 
         Args:
             load: The load, B = 1.
@@ -210,20 +196,19 @@ class Simulator:
             return Candidate("rest", rest, 0.0)
         best: Candidate | None = None
         last: Candidate | None = None
-        for last in self._candidates(load, guess, place, request):
+        for last, stage in self._candidates(load, guess, place, request):
             if request.error is not None:
                 last = self._with_error(load, last, request)
             if best is None or request.rank(last) <= request.rank(best):
                 best = last
-            if request.is_met(last) or request.over(self._pace + self._estimate_time):
+            if request.is_met(last) or request.over(stage):
                 break
         assert best is not None
         assert last is not None
         ended, state = last.state, best.state
         kept = (state.residual < tol) & (state.volume_ratio > 0) & ~ended.converged
         status = torch.where(kept, int(Status.CONVERGED), ended.status)
-        state = state._replace(status=status, load_factor=ended.load_factor)
-        return self._with_error(load, best._replace(state=state), request)
+        return best._replace(state=state._replace(status=status, load_factor=ended.load_factor))
 
     def _products(self, place: RangeCheck, request: Request) -> int:
         """Return the products with the tangent in an estimate, which softening needs.
@@ -241,20 +226,21 @@ class Simulator:
         """Return a solution with its estimated error.
 
         The error in the modes and the known one outside of them are the estimate if their sum is
-        sufficient. Otherwise it is the larger one of the error in the modes and of
-        `estimate_error`.
+        sufficient, or known and there is no time for another one. Otherwise it is the larger one of
+        the error in the modes and of `estimate_error`.
         """
         known = candidate.error_in_modes + candidate.error_outside
         if candidate.error is not None:
             return candidate
-        if known <= request.sufficient_error:
+        is_known = math.isfinite(known) and request.over("estimate")
+        if known <= request.sufficient_error or is_known:
             return candidate._replace(error=known)
-        begin, state = time.perf_counter(), candidate.state
-        found = estimate_error(
-            self.scene.linear, load, state.displacement, candidate.evaluation,
-            products=request.products,
-        )  # fmt: skip
-        self._estimate_time = time.perf_counter() - begin
+        state = candidate.state
+        with request.durations.timed("estimate"):
+            found = estimate_error(
+                self.scene.linear, load, state.displacement, candidate.evaluation,
+                products=request.products,
+            )  # fmt: skip
         if found.is_indefinite:
             state = state.unstable()
         error = max(candidate.error_in_modes, found.error)
@@ -262,47 +248,61 @@ class Simulator:
 
     def _candidates(
         self, load: Load, guess: Guess | None, place: RangeCheck, request: Request
-    ) -> Iterator[Candidate]:
-        """Yield the solutions of the methods, the cheapest first; see `_solve`.
+    ) -> Iterator[tuple[Candidate, str]]:
+        """Yield the solutions of the methods, the cheapest first, and what would follow.
 
         The hybrid continues from the prediction, or with `warm` from the last displacement, if that
         is near equilibrium. Otherwise Newton's method starts from rest, since its iterates from far
-        seldom lead to a solution.
+        seldom lead to a solution. See `_solve`; stages that follow are those of `Durations`.
         """
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
-        self._pace = self._first_pace
-        starts = []
+        starts, durations = [], request.durations
         if guess is not None:
             for first in self._predictions(load, guess, request):
-                yield first  # the last one is the best
+                yield first, "start"  # the last one is the best
             if not request.is_more_than_prediction:
                 return
             starts.append(first)
-        clock = time.perf_counter()
-        if request.warm and self._before and torch.equal(self._before[0], load.parameters):
-            starts.append(Candidate.evaluated("last", problem, self._before[1], load, tol))
-        distances = [self._distance(load, one) for one in starts]
-        if place.amplitude < MAX_LINEAR_AMPLITUDE:
-            linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
-            yield Candidate.evaluated("linear", problem, linear, load, tol)
+        with durations.timed("start"):
+            if request.warm and self._before and torch.equal(self._before[0], load.parameters):
+                starts.append(Candidate.evaluated("last", problem, self._before[1], load, tol))
+            distances = [self._distance(load, one) for one in starts]
         start = None
         if (least := min(distances, default=math.inf)) <= FAR:
             start = starts[distances.index(least)].state.displacement
-        for state in self._iterates(load, start, tol):
+        stage = "Newton" if start is None or not self.scene.is_compact else "iteration"
+        if place.amplitude < MAX_LINEAR_AMPLITUDE:
+            linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
+            yield Candidate.evaluated("linear", problem, linear, load, tol), stage
+        elif starts and request.over(stage):
+            return
+
+        def newton_is_over() -> bool:
+            nonlocal stage
+            stage = "Newton"
+            return request.over(stage)
+
+        clock = time.perf_counter()
+        for state in self._iterates(load, start, tol, newton_is_over):
             if int(state.iterations):
                 now = time.perf_counter()
-                self._pace, clock = now - clock, now
-                if int(state.iterations) == 1:
-                    self._first_pace = max(self._pace, PACE_DECAY * self._first_pace)
+                durations.add(stage, now - clock)
+                clock = now
             elif not state.converged:  # the initial state, which has been evaluated
                 continue
-            yield Candidate("hybrid" if state.from_guess else "full Newton", state)
+            yield Candidate("hybrid" if state.from_guess else "full Newton", state), stage
 
-    def _iterates(self, load: Load, start: Tensor | None, tol: float) -> Iterator[Solution]:
-        """Return the iterates of the hybrid from a start, of Newton's method without one."""
+    def _iterates(
+        self, load: Load, start: Tensor | None, tol: float, is_over: Callable[[], bool]
+    ) -> Iterator[Solution]:
+        """Yield the iterates of the hybrid from a start, of Newton's method without one.
+
+        `is_over` returns True if Newton's method may not follow Anderson's.
+        """
         if start is None:
             return replace(self.scene.corrector, tol=tol).iterate(load)
-        return default_hybrid(lambda load: start, self.scene, tol).iterate(load)
+        hybrid = default_hybrid(lambda load: start, self.scene, tol)
+        return replace(hybrid, is_over=is_over).iterate(load)
 
     @cached_property
     def _is_poor(self) -> bool:
@@ -340,12 +340,13 @@ class Simulator:
             return
         while last.correction is not None and last.known_error > request.sufficient_error:
             taken = int(last.state.iterations) + 1
-            if taken > self.steps or request.over(2 * self._estimate_time):
+            if taken > self.steps or request.over("correction"):
                 return
             u = last.state.displacement + last.correction
             corrected = Guess(u, error_outside=guess.error_outside)
-            following = self._in_modes(load, corrected, request, taken=taken)
-            following = self._with_error(load, following, request)
+            with request.durations.timed("correction"):
+                following = self._in_modes(load, corrected, request, taken=taken)
+                following = self._with_error(load, following, request)
             if not following.known_error < last.known_error:
                 return
             yield (last := following)
@@ -358,7 +359,7 @@ class Simulator:
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
         if self.newton is None:
             return Candidate.evaluated("prediction", problem, guess.displacement, load, tol)
-        begin, method = time.perf_counter(), "corrected" if taken else "prediction"
+        method = "corrected" if taken else "prediction"
         first = Candidate.evaluated(method, problem, guess.displacement, load, tol, taken)
         if not first.state.residual.isfinite():
             return first
@@ -366,14 +367,13 @@ class Simulator:
         enough = request.sufficient_error if taken < self.steps else FAR
         if in_range and guess.error <= enough:
             return first._replace(error=guess.error)
-        wanted, pace = ERROR if request.error is None else request.error, 0.0
-        states = self.newton.states(
+        wanted = ERROR if request.error is None else request.error
+        begin = time.perf_counter()
+        *_, state = self.newton.states(
             load, guess=guess.displacement, evaluation=first.evaluation, error_tol=wanted,
-            max_iter=self.steps - taken, is_over=lambda: request.over(pace + self._estimate_time),
+            max_iter=self.steps - taken, is_over=lambda: request.over("step"),
         )  # fmt: skip
-        state = next(states)
-        pace = time.perf_counter() - begin  # each step evaluates and corrects like this
-        *_, state = state, *states
+        request.durations.add("step", (time.perf_counter() - begin) / (1 + state.iterations))
         if state.iterations:
             iterations = taken + state.iterations
             evaluation = state.evaluation

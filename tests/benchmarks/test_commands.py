@@ -68,7 +68,7 @@ COMMANDS = {
         },
     ),
     "grasps": (
-        [UNROLLED, "count=2", "amplitudes=1"],
+        [UNROLLED, "count=2", "amplitudes=1", "hands=1", "frames=10"],
         {"grasps.csv": ("method", ["prediction", "corrected", "hybrid to 1e-6"])},
     ),
     "transfer": (["run=runs"], {"transfer.csv": ("trained_on", ["other", "tiny"])}),

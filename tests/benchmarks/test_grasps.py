@@ -60,3 +60,11 @@ def test_the_error_of_a_linear_network_has_slope_two(gripper, some):
     rows = grasps.against_amplitude(gripper, some)
     assert [row.amplitude for row in rows] == [2.0**-k for k in range(grasps.HALVINGS + 1)]
     assert grasps.slope(rows) == pytest.approx(2, abs=0.3)
+
+
+def test_a_hand_that_moves_is_accurate_in_each_frame(gripper, some):
+    hand = grasps.moving_hand(gripper.surrogate, some[:2], None, steps=6, frames=20)
+    assert (hand.frames, hand.late) == (40, 0)
+    assert hand.rel_L2_worst < 1e-2
+    assert hand.rel_L2_median < 1e-3
+    assert 0 < hand.p50_ms <= hand.p99_ms

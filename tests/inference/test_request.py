@@ -1,12 +1,14 @@
-"""Order of the solutions of a call."""
+"""Order of the solutions of a call, and its budget."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
-from dpl.inference.request import Candidate, Request
+from dpl.inference.request import FINISH, Candidate, Durations, Request
 
 
 def candidate(residual, error, volume_ratio=0.5, *, converged=False):
@@ -45,3 +47,40 @@ def test_an_inverted_solution_is_behind_every_valid_one(options, better):
     ranks = [request.rank(one) for one in wanted]
     assert ranks == sorted(ranks)
     assert len(set(ranks)) == len(ranks)
+
+
+@pytest.mark.parametrize("budget", [5.0, 10.0, 14.0, 30.0])
+def test_calls_whose_stages_take_random_times_keep_their_budget(monkeypatch, budget):
+    """At most 1 % of 1,000 calls exceed it by 20 %; stages that never fit are hardly tried."""
+    now, rng, durations = [0.0], np.random.default_rng(0), Durations()
+    clock = SimpleNamespace(perf_counter=lambda: now[0])
+    monkeypatch.setattr("dpl.inference.request.time", clock)
+
+    def run(stage, milliseconds):
+        with durations.timed(stage):
+            now[0] += 1e-3 * milliseconds * rng.lognormal(sigma=0.2)
+
+    late = iterations = 0
+    for _ in range(1000):
+        checked = Request.checked(None, budget, None, warm=False)
+        request = replace(checked, begin=now[0], durations=durations)
+        run("prediction", 1.0)
+        while not request.over("iteration"):
+            run("iteration", 1.0)
+            iterations += 1
+        if not request.over("Newton"):
+            run("Newton", 100.0)
+        run(FINISH, 1.0)
+        late += 1e3 * (now[0] - request.begin) > 1.2 * budget
+    assert 1 <= late <= 10
+    assert iterations > 1000 * (budget - 4)
+
+
+def test_one_slow_run_does_not_prevent_a_stage_for_ever():
+    durations = Durations()
+    request = replace(Request.checked(None, 1e9, None, warm=False), durations=durations)
+    durations.add("iteration", 1e12)
+    refused = 0
+    while request.over("iteration"):
+        refused += 1
+    assert 100 < refused < 5000

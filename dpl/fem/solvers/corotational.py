@@ -98,8 +98,8 @@ class CorotationalPreconditioner:
         (nodes, dim), volumes = self.problem.shape, dV.sum(axis=1)
         gradients = np.zeros((len(dN), dN.shape[2], 3))
         gradients[..., :dim] = np.einsum("eqaj,eq->eaj", dN, dV) / volumes[:, None, None]
-        numbers = np.full((nodes, 3), -1)
-        numbers[:, :dim] = self.problem.pattern.number
+        numbers, free_numbers = np.full((nodes, 3), -1), self.problem.discretisation.free_numbers
+        numbers[np.divmod(free_numbers, dim)] = np.arange(len(free_numbers))
         free, each = numbers >= 0, np.broadcast_to(volumes[:, None], cells.shape)
         around = np.bincount(cells.ravel(), each.ravel(), nodes)
         turned = free & (free.sum(axis=1, keepdims=True) > 1)

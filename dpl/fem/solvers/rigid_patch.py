@@ -1,7 +1,7 @@
 """A patch of the boundary that a gripper holds: its rigid motion, its compliance, the held body."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import NamedTuple, Self
 
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from dpl.fem.linear.interface import Array, Factor
 from dpl.fem.mesh.regions import Region, nodes_in
-from dpl.fem.problem import Problem
+from dpl.fem.problem import Evaluation, Problem
+from dpl.fem.solvers.corotational import CorotationalPreconditioner
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.newton import Newton
 
@@ -132,15 +134,33 @@ class RigidPatch:
         """Return the values, (m,), of a nodal field (N, D) at held degrees of freedom."""
         return field.reshape(-1)[self._dofs]
 
+    @property
+    def missing_rows(self) -> int:
+        """Number of rows of the compliance that are not computed."""
+        return len(self._dofs) - sum(map(len, self._rows))
+
+    def prepare(self, *, one: bool = False) -> None:
+        """Compute the rows of the compliance that are left, or the next one."""
+        dofs, free = self._dofs[len(self._dofs) - self.missing_rows :], self.problem.free
+        dofs = dofs[:1] if one else dofs
+        units = torch.zeros(len(dofs), self.held.numel(), dtype=torch.float64)
+        units[torch.arange(len(dofs)), dofs] = 1.0
+        right = units.view(-1, *self.held.shape)[:, free].numpy()
+        factor = self.linear.float32_factor  # a block of one row takes longer than one solve
+        rows = factor.solve(right[0], RTOL)[None] if one else factor.solve_many(right, RTOL)
+        self._rows.append(torch.from_numpy(rows)[:, self.held[free]])
+
+    @cached_property
+    def _rows(self) -> list[Tensor]:
+        """Rows of the compliance that are computed, (k, m) each."""
+        return []
+
     @cached_property
     def compliance_factor(self) -> Tensor:
         """Cholesky factor of the linear displacements of the patch by forces on it, (m, m)."""
-        count, free = len(self._dofs), self.problem.free
-        units = torch.zeros(count, self.held.numel(), dtype=torch.float64)
-        units[torch.arange(count), self._dofs] = 1.0
-        right = units.view(count, *self.held.shape)[:, free].numpy()
-        columns = torch.from_numpy(self.linear.float32_factor.solve_many(right, RTOL))
-        compliance = columns[:, self.held[free]]
+        if self.missing_rows:
+            self.prepare()
+        compliance = torch.cat(self._rows)
         return torch.linalg.cholesky((compliance + compliance.mT) / 2)
 
     def stiffness_times(self, displacement: Tensor) -> Tensor:
@@ -150,7 +170,7 @@ class RigidPatch:
     def newton(self, corrector: Newton, displacement: Tensor) -> Newton:
         """Return Newton's method for the body with the patch displaced by (m,) [-].
 
-        Pattern and factor of K(0) of the held body are computed once.
+        The preconditioner of the held body is computed once.
 
         Args:
             corrector: Newton's method of the body, whose options are used.
@@ -164,8 +184,27 @@ class RigidPatch:
     @cached_property
     def _held_linear(self) -> LinearSolver:
         """Linear solver of the body with the patch held at rest."""
-        body = replace(self.problem, free=self.problem.free & ~self.held)
-        return LinearSolver(body, self.linear.tol, self.linear.linear)
+        parts = {each.name: getattr(self.problem, each.name) for each in fields(Problem)}
+        parts |= {"free": self.problem.free & ~self.held, "discretisation": None}
+        body = _HeldProblem(**parts, whole=self.problem)
+        return _HeldSolver(body, self.linear.tol, self.linear.linear, patch=self)
+
+    def moved(self, displacement: Tensor, goal: Tensor) -> Tensor:
+        """Return a displacement whose patch is at a goal, from one near it, (N, D) [-].
+
+        The difference is a linear displacement in the rotated frames of the nodes.
+
+        Args:
+            displacement: Displacement of the body, (N, D) [-].
+            goal: Displacement of the held degrees of freedom, (m,) [-].
+        """
+        problem, dim = self.problem, displacement.shape[1]
+        frames = self.linear.corotational.at(displacement[None]).rotations
+        turns = torch.from_numpy(frames)[:, :dim, :dim]
+        gap = _products(turns.mT, self.at(goal - self.of_field(displacement)))
+        force = problem.restrict(self.at(self.stiffness_times(self.of_field(gap))))
+        added = problem.extend(self.linear.float32_factor.solve(force))
+        return displacement + _products(turns, added)
 
     def wrench(self, force: Tensor, displacement: Tensor) -> Wrench:
         """Return the resultant of nodal forces (N, D) [-] on the patch at a displacement (N, D)."""
@@ -177,6 +216,78 @@ class RigidPatch:
         else:
             moment = (arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0]).sum()[None]
         return Wrench(forces.sum(dim=0), moment)
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldProblem(Problem):
+    """A body with a held patch; its own pattern and loops are made when a tangent is needed.
+
+    Attributes:
+        whole: The body without the gripper, whose internal forces are the same.
+    """
+
+    whole: Problem = field(kw_only=True, repr=False)
+
+    def evaluate(self, displacement: Tensor) -> Evaluation:
+        """Return internal force and min det F, without derivatives."""
+        return self.whole.evaluate(displacement)
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldFactor(Factor):
+    """K(0)^-1 of a body with a held patch, from the factor of the body without the gripper.
+
+    A first solve moves the patch; the second one has the forces that bring it back to its place.
+
+    Attributes:
+        patch: The patch.
+        negative_pivots: 0.
+    """
+
+    patch: RigidPatch
+    negative_pivots: int = 0
+
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return x, (n,), with K x = right, in the accuracy of float32."""
+        patch, factor = self.patch, self.patch.linear.float32_factor
+        force = np.zeros(len(self._held))
+        force[~self._held] = right
+        moved = torch.from_numpy(factor.solve(force)[self._held])
+        force[self._held] = -patch.stiffness_times(moved).numpy()
+        return factor.solve(force)[~self._held]
+
+    @cached_property
+    def _held(self) -> NDArray[np.bool_]:
+        """Mask of the held ones among the free degrees of freedom without the gripper."""
+        return self.patch.held[self.patch.problem.free].numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldSolver(LinearSolver):
+    """Linear solver of a body with a held patch; one preconditioner for all its displacements.
+
+    Attributes:
+        patch: The patch.
+    """
+
+    patch: RigidPatch = field(kw_only=True, repr=False)
+
+    @cached_property
+    def float32_factor(self) -> Factor:
+        """Factor of K(0) in float32, that of the body without the gripper unless it iterates."""
+        whole = self.patch.linear.float32_factor
+        iterates = whole.negative_pivots is None
+        return super().float32_factor if iterates else _HeldFactor(self.patch)
+
+    @cached_property
+    def corotational(self) -> CorotationalPreconditioner:
+        """Preconditioner from `float32_factor`."""
+        return self.parent.corotational if self.parent else super().corotational
+
+
+def _products(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """Return the products of matrices (N, D, D) and vectors (N, D)."""
+    return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
 def flat_part(problem: Problem, nodes: Tensor) -> tuple[Tensor, int]:

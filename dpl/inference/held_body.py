@@ -1,0 +1,193 @@
+"""A body whose patch a gripper holds: predicted forces, correction, equilibrium and errors."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dpl.fem import AndersonSolver, Load, Newton, RigidPatch, Solution, estimate_error
+from dpl.fem.solvers.error_estimate import PRODUCTS
+from dpl.inference.hybrid import Hybrid
+from dpl.inference.request import Candidate, Request
+
+MOTION_TOL = 1e-3  # largest error of a motion that is accepted, over its size [-]
+MAX_ITER = 16  # predictions for a motion
+MEMORY = 8  # iterations from which Anderson's method extrapolates
+CORRECTED = 3e-5  # relative error of a displacement below which its correction ends [-]
+CORRECTED_WARM = 3e-4  # the same of the frames of a moving hand [-]
+CONTRACTION = 0.5  # ratio of residuals below which a correction contracts [-]
+
+
+def predicted_forces(
+    patch: RigidPatch,
+    goal: Tensor,
+    predict: Callable[[Tensor], Tensor],
+    start: Tensor,
+    *,
+    scale: float = 0.0,
+    tol: float = MOTION_TOL,
+    max_iter: int = MAX_ITER,
+    is_over: Callable[[], bool] = bool,
+) -> tuple[Tensor, Tensor, int, bool]:
+    """Return forces of the gripper under which the predicted patch is displaced by the goal.
+
+    The result is the forces, (m,) [-], the displacement, (N, D) [-], the number of predictions,
+    and whether the gap between the predicted patch and the goal is below the tolerance.
+
+    The forces are unknowns at all held degrees of freedom. Each iteration adds the forces that
+    close the gap between predicted and prescribed displacement in the linear body; Anderson's
+    method extrapolates. The prediction with the smallest gap is the result.
+
+    Forces keep their direction while the body moves. An equilibrium that is stable only as long as
+    the gripper holds the patch, such as a column that it shortens beyond buckling, is not found.
+
+    Source: Anderson (1965), J. ACM 12; Walker, Ni (2011), SIAM J. Numer. Anal. 49 (as a least
+    squares problem of differences).
+
+    Args:
+        patch: The patch.
+        goal: Displacement of the held degrees of freedom, (m,) [-].
+        predict: Function from the forces of the gripper (N, D) [-] to a displacement (N, D) [-].
+        start: Forces to start from, (m,) [-].
+        scale: Size of the motion of the patch without the gripper [-]; errors are relative to it or
+            to the prescribed motion, whichever is larger.
+        tol: Relative error of the motion at which the iterations end [-].
+        max_iter: Largest number of predictions.
+        is_over: Returns True if no further prediction may be made; there is always one.
+    """
+    size = max(scale, float(goal.abs().max()))
+    energy = patch.compliance_factor.mT  # |L^T f| is the energy norm of forces
+    best, nearest = (torch.zeros_like(start), torch.zeros_like(patch.problem.points)), math.inf
+    forces: list[Tensor] = []
+    steps: list[Tensor] = []
+    force = start
+    for count in range(1, max_iter + 1):  # noqa: B007  # the number is returned
+        field = predict(patch.at(force))
+        gap = goal - patch.of_field(field)
+        largest = float(gap.abs().max())
+        found = largest <= tol * size
+        if found or largest < nearest:
+            best, nearest = (force, field), largest
+        if found or not math.isfinite(largest) or is_over():
+            break
+        forces, steps = [*forces[-MEMORY:], force], [*steps[-MEMORY:], patch.stiffness_times(gap)]
+        force = force + steps[-1]
+        if len(steps) > 1:
+            changes = torch.stack(steps).diff(dim=0).mT
+            moves = torch.stack(forces).diff(dim=0).mT
+            mix = torch.linalg.lstsq(energy @ changes, energy @ steps[-1][:, None]).solution
+            force = force - ((moves + changes) @ mix)[:, 0]
+    return *best, count, found
+
+
+@dataclass(frozen=True, eq=False)
+class HeldBody:
+    """A body whose patch is held at its goal.
+
+    Attributes:
+        patch: The patch.
+        goal: Its displacement, (m,) [-].
+        load: Other forces on the body, B = 1, without parameters of the law.
+        newton: Newton's method with the patch as a moved support.
+    """
+
+    patch: RigidPatch
+    goal: Tensor
+    load: Load
+    newton: Newton
+
+    def with_errors(self, candidate: Candidate, request: Request) -> Candidate:
+        """Return a candidate with the forces of the gripper and the error of its motion.
+
+        Its error is estimated if there is time for it. A correction that has contracted shows that
+        the preconditioner is near the inverse of the tangent. The estimate then needs no products
+        with the tangent.
+        """
+        patch, state, u = self.patch, candidate.state, candidate.state.displacement
+        evaluation, force = self.newton.problem.evaluate(u), candidate.force
+        if force is None:
+            force = patch.of_field(evaluation.internal[0] - self.load.force[0])
+        missed = float(patch.at(self.goal - patch.of_field(u[0])).norm(dim=1).max())
+        candidate = candidate._replace(force=force, motion_error=missed)
+        if request.over("errors"):
+            return candidate
+        products = 0 if candidate.known_error < CORRECTED_WARM else PRODUCTS
+        with request.durations.timed("errors"):
+            found = estimate_error(
+                self.newton.linear_solver, self.load, u, evaluation, products=products
+            )
+        largest = max(float(u.norm(dim=2).max()), 1e-300)
+        return candidate._replace(
+            state=state.unstable() if found.is_indefinite else state,
+            error=found.error + missed / largest,
+            correction=found.correction,
+        )
+
+    def wrench_errors(self, candidate: Candidate) -> tuple[float, float]:
+        """Return the estimated relative errors of force and moment of the gripper [-].
+
+        The estimates compare them with those of the corrected displacement: the correction behind
+        the estimated error of the displacement is added, and the linear forces that move the patch
+        to its goal. They cost one residual.
+        """
+        if candidate.correction is None:
+            return math.inf, math.inf
+        patch, u = self.patch, candidate.state.displacement
+        better = u + candidate.correction
+        reaction = self.newton.problem.evaluate(better).internal - self.load.force
+        moved = patch.stiffness_times(self.goal - patch.of_field(u[0]))
+        expected = patch.wrench(patch.at(patch.of_field(reaction[0]) + moved), better[0])
+        assert candidate.force is not None
+        found = patch.wrench(patch.at(candidate.force), u[0])
+        pairs = zip(found, expected, strict=True)
+        sizes = [(float((a - b).norm()), float(a.norm())) for a, b in pairs]
+        force, moment = (e / max(size, 1e-300) if e >= 0 else math.inf for e, size in sizes)
+        return force, moment
+
+    def corrected(self, guess: Tensor, steps: int, request: Request) -> Candidate | None:
+        """Return the iterate of least residual from a guess (N, D); None if that is inverted.
+
+        Iterations with the corotated factor of K(0) end with the budget, or when the error is below
+        `CORRECTED`, with `warm` `CORRECTED_WARM`: the last change times the ratio of the residuals
+        after and before it, if this ratio is below `CONTRACTION`.
+        """
+        enough = CORRECTED_WARM if request.warm else CORRECTED
+        valid: list[Solution] = []
+        error = math.inf
+        clock = time.perf_counter()
+        solver = AndersonSolver(self.newton, max_iter=steps)
+        for state in solver.iterate(self.load, guess=guess[None]):
+            now = time.perf_counter()
+            request.durations.add("step", now - clock)
+            clock = now
+            if not bool(state.volume_ratio > 0):
+                break
+            valid.append(state)
+            if len(valid) > 1:
+                before, u = valid[-2], state.displacement
+                ratio = float(state.residual / before.residual)
+                change = float((u - before.displacement).norm() / u.norm())
+                error = change * (ratio if ratio < CONTRACTION else 1.0)
+                if ratio < CONTRACTION and error < enough:
+                    break
+            if len(valid) <= steps and request.over("step", "errors"):
+                break
+        best = min(valid, key=lambda one: float(one.residual), default=None)
+        return None if best is None else Candidate("corrected", best, error)
+
+    def equilibrium(self, guess: Tensor, request: Request) -> Candidate:
+        """Return the equilibrium by Newton's method from a guess (1, N, D), else from rest.
+
+        The budget ends it at the last state.
+        """
+        clock = time.perf_counter()
+        for last in Hybrid(lambda load: guess, self.newton).iterate(self.load):
+            now = time.perf_counter()
+            request.durations.add("Newton", now - clock)
+            clock = now
+            if not last.converged and request.over("Newton", "errors"):
+                break
+        return Candidate("hybrid" if bool(last.from_guess) else "full Newton", last)
