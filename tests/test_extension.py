@@ -219,7 +219,7 @@ def view(surrogate):
     settings, request = ViewSettings(), body.sample(0)
     frame = body.solve(request, settings)
     (*_, last) = body.newton_frames(request, settings, frame)
-    assert last.converged
+    assert last.answer.converged
     patch = body.patch(int(scene.problem.points[:, 0].argmax()), 0.4)
     force = patch.force_along(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.5)
     assert bool(force.any())

@@ -15,34 +15,17 @@ _starting = threading.Lock()
 
 
 def die_with_parent(parent: int) -> None:
-    """End this process as soon as its parent process has ended.
+    """End this process as soon as its parent process, of this number, has ended.
 
-    On Linux the kernel does it (`prctl`), and the end of the parent's thread that started this
-    process counts. On other systems a thread checks the parent twice a second.
-
-    Args:
-        parent: Process number of the parent.
+    The kernel does it (`prctl`). The end of the parent's thread that started this process counts.
     """
     # imports are local, because `_Popen` passes only the source of this function
+    import ctypes
     import os
-    import sys
+    import signal
 
-    if sys.platform == "linux":
-        import ctypes
-        import signal
-
-        set_death_signal = 1  # PR_SET_PDEATHSIG
-        ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
-    else:
-        import threading
-        import time
-
-        def watch() -> None:
-            while os.getppid() == parent:
-                time.sleep(0.5)
-            os._exit(1)
-
-        threading.Thread(target=watch, daemon=True).start()
+    set_death_signal = 1  # PR_SET_PDEATHSIG
+    ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
     if os.getppid() != parent:  # it ended before the lines above
         os._exit(1)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from dpl.viewer.frames import Body, Frame, ViewSettings, arrow_ends
+from dpl.viewer.frames import Body, Frame, ViewSettings
 from dpl.viewer.surface import Floats
 
 FIELD_OF_VIEW = 0.6  # vertical angle of view [rad]
@@ -15,7 +15,7 @@ VIEW_3D, VIEW_2D = (0.62, -1.0, 0.48), (0.0, -0.02, 1.0)  # directions from a bo
 UP = (0.0, 0.0, 1.0)
 MAX_DEFLECTION = 1.0  # largest displacement over L that the camera takes into account [-]
 GAP = 0.08  # between two bodies over L [-]
-LABEL = 0.03, 0.07  # distance of a label from its body, and its height, over L [-]
+LABEL = 0.03, 0.07  # distance of a label from all shapes of its body, and its height, over L [-]
 MARGINS = (0.03, 0.03, 0.03, 0.03)  # empty margins of an image: left, right, below, above [-]
 
 
@@ -53,13 +53,8 @@ class Camera:
         """
         axes = _axes(-np.array(VIEW_2D if planar else VIEW_3D))
         x, y, z = axes @ points.T
-        half = float(np.tan(FIELD_OF_VIEW / 2))
-        left, right, below, above = (
-            size * (1 - 2 * margin)
-            for size, margin in zip(
-                (half * aspect, half * aspect, half, half), margins, strict=True
-            )
-        )
+        half = np.tan(FIELD_OF_VIEW / 2) * np.array([aspect, aspect, 1.0, 1.0])
+        left, right, below, above = half * (1 - 2 * np.array(margins))
         sides = [
             ((x - right * z).max(), (-x - left * z).max(), right, left),
             ((y - above * z).max(), (-y - below * z).max(), above, below),
@@ -86,46 +81,46 @@ def _axes(forward: Floats) -> Floats:
     return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
 
 
-def image_axes(*, planar: bool) -> Floats:
-    """Return unit vectors to the right and upwards in the image of `Camera.fit`, (2, 3)."""
-    return _axes(-np.array(VIEW_2D if planar else VIEW_3D))[:2]
-
-
 @dataclass(frozen=True, eq=False)
 class Placement:
     """Places of the body and of a second body that is compared with it.
 
     Attributes:
         planar: True for a body in 2D.
-        points: Points of the body at rest and under the largest loads, with arrows and labels,
-            over L, (n, 3).
+        points: Points of the body at rest and under the largest loads, with arrows and label, over
+            L, (n, 3).
+        label: Position of the label above them over L, (3,).
         offset: Position of the second body relative to the first over L, (3,).
     """
 
     planar: bool
     points: Floats
+    label: Floats
     offset: Floats
 
     @classmethod
     def of(cls, body: Body, node: int, radius: float) -> "Placement":
         """Return the places for loads on the patch of a node with a radius over L."""
-        surface = body.surface
-        planar, rest = surface.planar, surface.undeformed
-        right, up = image_axes(planar=planar)
-        bare = np.concatenate([rest, surface.supports.vertices(rest)])
-        shapes = [bare]
-        for frame in largest_loads(body, node, radius):
-            shapes.append(np.concatenate([bare, frame.points, arrow_ends(surface, frame)]))
-        for k, shape in enumerate(shapes):
-            top = label_position(shape, rest, planar=planar) + LABEL[1] * up
-            shapes[k] = np.concatenate([shape, top[None]])
+        planar, rest = body.surface.planar, body.surface.undeformed
+        right, up, _ = _axes(-np.array(VIEW_2D if planar else VIEW_3D))
+        bare = np.concatenate([rest, body.surface.supports(rest).reshape(-1, 3)])
+        loaded = largest_loads(body, node, radius)
+        shapes = [bare, *(np.concatenate([f.points, body.arrow_ends(f)]) for f in loaded)]
         points = np.concatenate(shapes)
-        choices = []
-        for axis, along in ((up, np.eye(3)[1 if planar else 2]), (right, right)):
-            extent = max(float(np.ptp(shape @ axis)) for shape in shapes)
-            choices.append((extent + GAP) / float(along @ axis) * along)
-        places = [cls(planar, points, offset) for offset in choices]
-        return min(places, key=lambda place: _distance(place.camera(both=True)))
+        middle = (rest.min(axis=0) + rest.max(axis=0)) / 2
+        label = middle + ((points @ up).max() + LABEL[0] - middle @ up) * up
+        points = np.concatenate([points, [label + LABEL[1] * up]])
+        space = LABEL[0] + LABEL[1] + GAP  # between a body and the other one
+        offsets = [
+            (max(np.ptp(shape @ axis) for shape in shapes) + space) / (along @ axis) * along
+            for axis, along in ((up, np.eye(3)[1 if planar else 2]), (right, right))
+        ]
+        cameras = [
+            Camera.fit(np.concatenate([points, points + offset]), planar=planar)
+            for offset in offsets
+        ]
+        distances = [np.linalg.norm(camera.position - camera.look_at) for camera in cameras]
+        return cls(planar, points, label, offsets[int(np.argmin(distances))])
 
     @property
     def ground(self) -> float:
@@ -142,10 +137,6 @@ class Placement:
         return Camera.fit(points, planar=self.planar, aspect=aspect)
 
 
-def _distance(camera: Camera) -> float:
-    return float(np.linalg.norm(camera.position - camera.look_at))
-
-
 def largest_loads(body: Body, node: int, radius: float) -> Iterator[Frame]:
     """Yield the frames of the largest loads of the training along all axes and diagonals.
 
@@ -153,17 +144,10 @@ def largest_loads(body: Body, node: int, radius: float) -> Iterator[Frame]:
     predict any displacement.
     """
     patch, dim = body.patch(node, radius), body.scene.problem.shape[1]
-    axes = np.concatenate([np.eye(dim), -np.eye(dim)])
-    diagonals = np.array(list(itertools.product((-1.0, 1.0), repeat=dim)))
-    for direction in torch.from_numpy(np.concatenate([axes, diagonals])):
+    grid = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), repeat=dim))).double()
+    number = grid.abs().sum(dim=1)
+    for direction in grid[(number == 1) | (number == dim)]:
         frame = body.solve(body.request(patch.force_along(direction, 1.0)), ViewSettings())
         size = np.abs(frame.points - body.surface.undeformed).max()
         if size <= MAX_DEFLECTION:  # False for values that are not finite
             yield frame
-
-
-def label_position(shown: Floats, rest: Floats, *, planar: bool) -> Floats:
-    """Return a position above all shown points (n, 3), in the middle of the body at rest (S, 3)."""
-    _, up = image_axes(planar=planar)
-    middle = (rest.min(axis=0) + rest.max(axis=0)) / 2
-    return np.asarray(middle + (float((shown @ up).max()) + LABEL[0] - middle @ up) * up)

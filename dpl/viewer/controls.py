@@ -1,21 +1,21 @@
 """Panel of the page: controls, and readings as HTML. All text is escaped."""
 
 import html
-from collections.abc import Iterable
+import math
 from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.ticker import EngFormatter
 from numpy.typing import ArrayLike
 from torch import Tensor
 from viser import ViserServer
 
 from dpl.fem import HasModes
 from dpl.inference.answer import LEAST_PERCENTAGE, UNKNOWN, UNRELIABLE, relative
-from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, Frame, ViewSettings
-from dpl.viewer.recording import MAX_FRAMES, RADIUS, SUFFIXES, Recording
-from dpl.viewer.renderer import band_colours
-from dpl.viewer.units import engineering, round_step, scaled, tick_labels, unit_for
+from dpl.viewer.frames import QUANTITIES, Body, Frame, ViewSettings
+from dpl.viewer.recording import RADIUS, SUFFIXES
+from dpl.viewer.renderer import band_colours, engineering
 
 GOOD, WARNING, BAD = "#15803d", "#b45309", "#b91c1c"
 GOOD_ERROR = 0.01  # estimated error below which it is green [-]
@@ -35,7 +35,8 @@ ABOUT = {
 }
 RADII = {PULL: RADIUS, GRASP: 0.15}  # of the patch over L, at first [-]
 AXES = {"x": 0, "y": 1, "z": 2}
-METHODS = {PREDICTION: None, **{f"residual below {tol:.0e}": tol for tol in TOLERANCES}}
+METHODS = {PREDICTION: None, **{f"residual below {tol:.0e}": tol for tol in (1e-3, 1e-6, 1e-8)}}
+METHODS[BUDGET] = 1e-8  # relative residuals
 
 
 class Controls:
@@ -43,15 +44,12 @@ class Controls:
 
     Attributes:
         mode: Mode of a drag, `PULL` or `GRASP`.
-        radius: Radius of the patch over L; each mode has its own.
+        radii: Sliders of the radius of the patch over L, by mode; `radius` is the selected value.
         direction, amplitude: The patch load, visible in the mode `PULL`.
-        axis, angle, sliding: Rotation of the patch and whether it slides, visible in the mode
-            `GRASP`; in 2D there is no axis.
+        axis, angle, sliding: Motion of the patch, visible in the mode `GRASP`; in 2D without axis.
         young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
         parameters: Sliders of the ranges of law and follower loads, by name.
-        sample, reset, fit: Buttons for a random load, for no load and for the camera.
-        method, budget, quantity, edges, show_newton: Method and display.
-        record, save: Buttons of the recording.
+        readings, details: HTML of the result; `state` is that of the recording.
         of_load, of_moduli, of_settings: The widgets that change load or grasp, moduli or settings.
         follows_frame: True while the page, a drag or a random load determines the load, so that the
             slider shows the amplitude of the frame.
@@ -60,86 +58,79 @@ class Controls:
     def __init__(self, server: ViserServer, body: Body, title: str, folder: Path) -> None:
         """Add the widgets to the panel; those that few users need are in closed folders."""
         gui, scene = server.gui, body.scene
-        self._gui, self._body = gui, body
-        nodes, dim = scene.problem.shape
+        self._gui, self._body, self.follows_frame = gui, body, True
         law = type(scene.problem.material).__name__
-        about = f"{title} · {nodes * dim:,} degrees of freedom · {law}"
-        gui.add_html(message(about, "inherit"))
-        self._result, self._legend = gui.add_html(""), gui.add_html("")
-        self._newton = gui.add_html("", visible=False)
-        self._error = gui.add_html("")
-        self._add_hand_controls()
-        with gui.add_folder("Details of the result", expand_by_default=False):
-            self._details = gui.add_html("")
-        with gui.add_folder("Load", expand_by_default=False):
-            self._add_load_controls()
-        with gui.add_folder("Method and view", expand_by_default=False):
-            self._add_method_controls()
-        self.show_mode()
-        with gui.add_folder("Record", expand_by_default=False):
-            self.record = gui.add_button("Start recording", color="red")
-            self._state = gui.add_html(message(f"Files are saved in {folder}", "inherit"))
-            self.save = gui.add_button_group("save as", tuple(SUFFIXES))
-        self.follows_frame = True
-        of_patch = (self.radius, self.axis, self.angle, self.sliding)
-        self.of_load = (self.direction, self.amplitude, *of_patch)
-        self.of_moduli = (self.young, *self.parameters.values())
-        shown = (self.quantity, self.edges, self.show_newton)
-        self.of_settings = (self.method, self.budget, *shown)
-
-    def _add_hand_controls(self) -> None:
-        gui, body = self._gui, self._body
+        size = math.prod(scene.problem.shape)
+        gui.add_html(message(f"{title} · {size:,} degrees of freedom · {law}", "inherit"))
+        self.readings = gui.add_html("")
         self._about = gui.add_html("")
         self.mode = gui.add_dropdown("drag", (PULL, GRASP))
         self.axis = gui.add_dropdown("rotation axis", tuple(AXES), initial_value="y")
         self.angle = gui.add_slider("rotation [°]", -90.0, 90.0, 1.0, 0.0, marks=(-90, 0, 90))
-        stresses = {name: f"{name} [Pa]" for name in body.scene.problem.follower_loads.ranges}
-        labels = LABELS | stresses
+        labels = {name: f"{name} [Pa]" for name in scene.problem.follower_loads.ranges} | LABELS
         self.parameters = {
             name: gui.add_slider(
                 labels.get(name, name), *ends, round_step(*ends), body.parameters[name]
             )
-            for name, ends in body.scene.loads.parameter_ranges.items()
+            for name, ends in scene.loads.parameter_ranges.items()
         }
         self.quantity = gui.add_dropdown("colours", tuple(QUANTITIES))
         self.sample = gui.add_button("Random training load")
         self.reset = gui.add_button("Reset", color="gray")
+        with gui.add_folder("Details of the result", expand_by_default=False):
+            self.details = gui.add_html("")
+        with gui.add_folder("Load", expand_by_default=False):
+            self._add_load_controls()
+        with gui.add_folder("Method and view", expand_by_default=False):
+            self.method = gui.add_dropdown("method", tuple(METHODS))
+            self.budget = gui.add_number("budget [ms]", 20.0, min=0.1, max=10_000.0)
+            self.edges = gui.add_checkbox("mesh edges", False)
+            self.show_newton = gui.add_checkbox("compare Newton", False)
+            self.fit = gui.add_button("Fit the view", color="gray")
+        with gui.add_folder("Record", expand_by_default=False):
+            self.record = gui.add_button("Start recording", color="red")
+            self.state = gui.add_html(message(f"Files are saved in {folder}", "inherit"))
+            self.save = gui.add_button_group("save as", tuple(SUFFIXES))
+        of_patch = (*self.radii.values(), self.axis, self.angle, self.sliding)
+        self.of_load = (self.direction, self.amplitude, *of_patch)
+        self.of_moduli = (self.young, *self.parameters.values())
+        shown = (self.quantity, self.edges, self.show_newton)
+        self.of_settings = (self.method, self.budget, *shown)
+        self.show_mode()
 
     def _add_load_controls(self) -> None:
         gui, body, loads = self._gui, self._body, self._body.scene.loads
         span = loads.patch_radius if isinstance(loads, HasModes) else (0.0, 1.0)
         low, high = float(span[0]), max(float(span[1]), 0.05)
-        first = min(max(RADII[PULL], low), high)
-        self._radii = {PULL: first, GRASP: min(RADII[GRASP], high)}
-        self.radius = gui.add_slider("radius / L", 0.0, high, 0.01, first)
+        first = {PULL: min(max(RADII[PULL], low), high), GRASP: min(RADII[GRASP], high)}
+        self.radii = {
+            mode: gui.add_slider("radius / L", 0.0, high, 0.01, first[mode]) for mode in RADII
+        }
         upwards = (0.0, 1.0, 0.0) if body.surface.planar else (0.0, 0.0, 1.0)
         self.direction = gui.add_vector3("direction", upwards, step=0.1)
         self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
         hint = "hold the patch along its normal alone, so that it slides in its plane"
         self.sliding = gui.add_checkbox("sliding", False, hint=hint)
-        unit, self._young_unit = unit_for(body.young, "Pa")
-        low, high = (value / self._young_unit for value in body.young_range)
-        middle = body.young / self._young_unit
-        self.young = gui.add_slider(f"E [{unit}]", low, high, round_step(low, high), middle)
-        self._shown_mode = PULL
-
-    def _add_method_controls(self) -> None:
-        gui = self._gui
-        self.method = gui.add_dropdown("method", (*METHODS, BUDGET))
-        self.budget = gui.add_number("budget [ms]", 20.0, min=0.1, max=10_000.0)
-        self.edges = gui.add_checkbox("mesh edges", False)
-        self.show_newton = gui.add_checkbox("compare Newton", False)
-        self.fit = gui.add_button("Fit the view", color="gray")
+        exponent = 3 * math.floor(math.log10(body.young) / 3)
+        self._young_unit = 10.0**exponent
+        low, high, middle = (x / self._young_unit for x in (*body.young_range, body.young))
+        name = f"E [{EngFormatter.ENG_PREFIXES[exponent]}Pa]"
+        self.young = gui.add_slider(name, low, high, round_step(low, high), middle)
 
     def show_mode(self) -> None:
-        """Show the controls of the selected mode, with the last radius of this mode."""
+        """Show the controls of the selected mode."""
         mode = self.mode.value
         self._about.content = message(ABOUT[mode], "inherit")
-        self._radii[self._shown_mode] = self.radius.value
-        self.radius.value, self._shown_mode = self._radii[mode], mode
+        for of_mode, radius in self.radii.items():
+            radius.visible = of_mode == mode
         self.direction.visible = self.amplitude.visible = mode == PULL
         self.angle.visible = self.sliding.visible = mode == GRASP
         self.axis.visible = mode == GRASP and not self._body.surface.planar
+
+    @property
+    def radius(self) -> float:
+        """Radius of the patch over L [-]."""
+        return float(self.radii[self.mode.value].value)
 
     @property
     def rotation(self) -> Tensor:
@@ -152,70 +143,50 @@ class Controls:
     @property
     def modulus(self) -> float:
         """Young's modulus of the slider [Pa]; an assigned value is limited to its range."""
-        value = self.young.value * self._young_unit
-        return float(np.clip(value, *self._body.young_range))
+        return float(np.clip(self.young.value * self._young_unit, *self._body.young_range))
 
     @modulus.setter
     def modulus(self, value: float) -> None:
-        within = float(np.clip(value, *self._body.young_range))
-        self.young.value = within / self._young_unit
+        self.young.value = float(np.clip(value, *self._body.young_range)) / self._young_unit
 
     def settings(self) -> ViewSettings:
         """Return method and quantity."""
-        within_budget = self.method.value == BUDGET
-        return ViewSettings(
-            self.quantity.value,
-            TOLERANCES[-1] if within_budget else METHODS.get(self.method.value),
-            self.budget.value if within_budget else None,
-            bool(self.show_newton.value),
-        )
+        budget = self.budget.value if self.method.value == BUDGET else None
+        tol, show_newton = METHODS[self.method.value], bool(self.show_newton.value)
+        return ViewSettings(self.quantity.value, tol, budget, show_newton)
 
-    def show_frame(self, frame: Frame, top: float, node: int) -> None:
-        """Update result, details, legend and, with `follows_frame`, the amplitude.
+    def show_frame(self, frame: Frame, top: float, node: int, below: str) -> None:
+        """Update readings, details and, with `follows_frame`, the amplitude.
 
-        `node` is the node whose displacement is shown.
+        Args:
+            frame: Frame of a result of the simulator.
+            top: Upper end of the colours; 0: there is no legend.
+            node: Node whose displacement is shown.
+            below: HTML below the legend.
         """
-        self._result.content, self._details.content = result_tables(frame, node)
-        self._legend.content = legend(frame, top)
-        if self.follows_frame and frame.answer is not None:
-            limit = float(self.amplitude.max)
-            self.amplitude.value = round(min(float(frame.answer.amplitude), limit), 2)
-
-    def show_newton_frame(self, frame: Frame | None, visible: bool) -> None:
-        """Update the table of Newton, or hide it."""
-        self._newton.content, self._newton.visible = newton_table(frame), visible
-
-    def show_problem(self, text: str, colour: str = BAD) -> None:
-        """Show why a request is not solved; an empty text removes the message."""
-        self._error.content = message(text, colour)
-
-    def show_recording(self, recording: Recording) -> None:
-        """Update the label of the record button."""
-        running, count = recording.running, len(recording)
-        stop = f"Stop ({count} of {MAX_FRAMES} frames)"
-        self.record.label = stop if running else "Start recording"
-        if running:
-            self.show_state(f"{count} frames", "inherit")
-
-    def show_state(self, text: str, colour: str = WARNING) -> None:
-        """Show a message below the record button."""
-        self._state.content = message(text, colour)
+        scene = self._body.scene
+        amplitude = frame.request.amplitude(frame.answer, scene)
+        result, details = result_tables(frame, node, amplitude)
+        self.readings.content = result + (legend(frame, top) if top > 0 else "") + below
+        self.details.content = details
+        if self.follows_frame:
+            self.amplitude.value = round(min(amplitude, float(self.amplitude.max)), 2)
 
 
-def result_tables(frame: Frame, node: int) -> tuple[str, str]:
+def result_tables(frame: Frame, node: int, amplitude: float) -> tuple[str, str]:
     """Return the table of a result of the simulator, and that of its details.
 
-    `node` is the node whose displacement is shown, the centre of the patch.
+    `node` is the node whose displacement is shown, the centre of the patch; `amplitude` is the size
+    of the load over the largest of the training.
     """
-    answer, grasp = frame.answer, frame.grasp
-    assert answer is not None
+    grasp, answer = frame.grasp, frame.answer
     error, outside = float(answer.error), answer.out_of_distribution
     colour = GOOD if error < GOOD_ERROR else WARNING if error < UNRELIABLE else BAD
     text = relative(error) if error < UNKNOWN else "above 100 %"
     text = f"below {relative(LEAST_PERCENTAGE)}" if error < LEAST_PERCENTAGE else text
     unit = ("N", "N m") if frame.displacement.shape[1] == 3 else ("N/m", "N")
     place = "outside" if outside else "unknown" if np.isnan(answer.out_of_span) else "inside"
-    span = ("training range", f"{place}, amplitude {frame.amplitude:.2f}", f"color:{BAD}" * outside)
+    span = ("training range", f"{place}, amplitude {amplitude:.2f}", f"color:{BAD}" * outside)
     forces = [("total force", _size(frame.load.force.sum(dim=0), unit[0]), BOLD)]
     warnings, others = [span] * outside, [span]
     if grasp is not None:  # the forces of a good grasp may be outside
@@ -234,20 +205,24 @@ def result_tables(frame: Frame, node: int) -> tuple[str, str]:
     details = [
         ("computed by", str(answer.method), ""),
         ("linear solves" if grasp is None else "iterations", f"{answer.iterations}", ""),
-        ("residual ‖R‖/‖f‖", f"{frame.residual:.1e}" if frame.residual else "0", ""),
-        ("min det F", f"{frame.volume_ratio:.3f}", ""),
+        ("residual ‖R‖/‖f‖", f"{answer.residual:.1e}" if answer.residual else "0", ""),
+        ("min det F", f"{answer.volume_ratio:.3f}", ""),
         *others,
     ]
     summary = f'<div style="line-height:1.35">{html.escape(answer.summary)}</div>'
-    return BOX.format(_rows(rows)), BOX.format(_rows(details) + summary)
+    return table(*rows), BOX.format(_rows(*details) + summary)
 
 
 def _size(vector: ArrayLike, unit: str) -> str:
     return engineering(float(np.linalg.norm(np.asarray(vector))), unit)
 
 
-def _rows(rows: Iterable[tuple[str, str, str]]) -> str:
-    """Return rows of a table: name, value and style of the value."""
+def table(*rows: tuple[str, str, str]) -> str:
+    """Return a table of rows: name, value and style of the value."""
+    return BOX.format(_rows(*rows))
+
+
+def _rows(*rows: tuple[str, str, str]) -> str:
     return "".join(
         ROW.format(html.escape(name), style, html.escape(value)) for name, value, style in rows
     )
@@ -258,7 +233,7 @@ def problem_of(frame: Frame, *, has_budget: bool = False) -> str:
 
     With a budget the user has chosen the time after which a grasp stops, so that this is no reason.
     """
-    if not frame.volume_ratio > 0:
+    if not frame.answer.volume_ratio > 0:
         return "Not valid: an element is inverted. Move the hand back."
     grasp = frame.grasp
     if grasp is not None and grasp.stopped and not has_budget:
@@ -278,38 +253,32 @@ def problem_of(frame: Frame, *, has_budget: bool = False) -> str:
 def newton_table(frame: Frame | None) -> str:
     """Return state, iteration and residual of an iterate of Newton; None before the first."""
     if frame is None:
-        return BOX.format(_rows([("Newton from zero", "starts when the load is constant", "")]))
-    colour, state = (GOOD, "converged") if frame.converged else (WARNING, "iterating")
-    rows = [
-        ("Newton from zero", state, f"color:{colour};{BOLD}"),
-        ("iteration", str(frame.iteration), ""),
-        ("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{colour}"),
-    ]
-    return BOX.format(_rows(rows))
+        return table(("Newton from zero", "starts when the load is constant", ""))
+    state, residual = frame.answer, float(frame.answer.residual)
+    colour, words = (GOOD, "converged") if state.converged else (WARNING, "iterating")
+    return table(
+        ("Newton from zero", words, f"color:{colour};{BOLD}"),
+        ("iteration", str(int(state.iterations)), ""),
+        ("residual ‖R‖/‖f‖", f"{residual:.1e}", f"color:{colour}"),
+    )
 
 
 def legend(frame: Frame, top: float) -> str:
-    """Return the colour bar, which ends at `top`, and the range of the values on the surface.
-
-    The result is empty if the bar would end at 0: all values are zero and the body is neutral.
-    """
-    if top <= 0:
-        return ""
-    quantity = frame.quantity
-    unit, size, labels = tick_labels(top, QUANTITIES[quantity])
+    """Return the colour bar, which ends at `top`, and the range of the values on the surface."""
+    unit = QUANTITIES[frame.quantity]
     finite = frame.values[np.isfinite(frame.values)]
     low, high = (finite.min(), finite.max()) if len(finite) else (0.0, 0.0)
     cells = "".join(
         f'<span style="flex:1;background:rgb({r},{g},{b})"></span>'
-        for r, g, b in band_colours(quantity).tolist()
+        for r, g, b in band_colours(frame.quantity).tolist()
     )
-    ticks = "".join(f"<span>{label}</span>" for label in labels)
-    span = f"{scaled(low, size)} to {scaled(high, size)} {unit}"
+    ticks = "".join(f"<span>{engineering(top * k / 4, unit)}</span>" for k in range(5))
+    span = f"{engineering(low, unit)} to {engineering(high, unit)}"
     return BOX.format(
-        f'<div style="margin-bottom:4px"><b>{html.escape(f"{quantity} [{unit}]")}</b></div>'
+        f'<div style="margin-bottom:4px"><b>{html.escape(frame.quantity)}</b></div>'
         f'<div style="display:flex;height:14px;border-radius:3px;overflow:hidden">{cells}</div>'
         f'<div style="display:flex;justify-content:space-between;font-size:11.5px;opacity:.75">'
-        f"{ticks}</div>" + _rows([("on the surface", span, "")])
+        f"{ticks}</div>" + _rows(("on the surface", span, ""))
     )
 
 
@@ -317,3 +286,13 @@ def message(text: str, colour: str = WARNING) -> str:
     """Return a line of text."""
     style = f"padding:2px 12px 6px;font-size:13px;color:{colour};line-height:1.35"
     return f'<div style="{style}">{html.escape(text)}</div>' if text else ""
+
+
+def round_step(low: float, high: float, *, steps: int = 200) -> float:
+    """Return a power of ten that divides an interval into at least `steps` steps.
+
+    The step is at least 1e-4 of the largest power of ten in the interval, so that values with this
+    step have at most five digits. Equal ends, as of a fixed value, count as an interval from zero.
+    """
+    step = 10.0 ** math.floor(math.log10((high - low or abs(high)) / steps))
+    return max(step, 10.0 ** (math.floor(math.log10(max(abs(low), abs(high)))) - 4))

@@ -1,24 +1,21 @@
 """Requests, solutions and the surface values that the viewer shows; independent of the browser."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem import Solution
-from dpl.fem.solvers import check_tol
-from dpl.inference import Answer, GraspAnswer, Simulator
+from dpl.inference import GraspAnswer, Simulator
 from dpl.system.threads import one_thread
-from dpl.viewer.requests import GraspRequest, LoadRequest, Patch, ViewRequest
+from dpl.viewer.requests import GraspRequest, LoadRequest, Patch
 from dpl.viewer.surface import Floats, Surface, exit_distance
 
 STRESS, ERROR = "von Mises stress", "error against FE"
 QUANTITIES = {"displacement": "m", STRESS: "Pa", ERROR: "m"}  # units without prefix
-TOLERANCES = (1e-3, 1e-6, 1e-8)  # relative residuals that the page offers
 YOUNG_FACTOR = 4.0  # range of E on the page, down and up, if the scene has a single value
 SAMPLE_STREAM = (0, 11)  # random stream of the loads that the page draws
 ARROW_LENGTH = 0.09, 0.07  # length at amplitude 0 and its increase per amplitude, over L [-]
@@ -45,8 +42,6 @@ class ViewSettings:
     def __post_init__(self) -> None:
         if self.quantity not in QUANTITIES:
             raise ValueError(f"quantity = {self.quantity!r} must be {' or '.join(QUANTITIES)}")
-        if self.tol is not None:
-            check_tol(self.tol)
 
 
 class Frame(NamedTuple):
@@ -59,36 +54,21 @@ class Frame(NamedTuple):
         points: Deformed surface over L, (S, 3) [-].
         values: Values of the quantity on the surface, (S,), in the unit of the quantity.
         quantity: Key of `QUANTITIES`.
-        answer: Result of the simulator; None for an iterate of Newton.
-        amplitude: Size of the load over the largest of the training [-]; 0 for an iterate.
-        iteration: Number of the Newton iteration; -1 for a result of the simulator.
-        residual: ||R_free|| / ||f|| [-].
-        volume_ratio: min det F [-].
-        converged: True if the residual is below the tolerance and no element is inverted.
+        answer: Result of the simulator, or a `Solution` of Newton.
     """
 
-    request: ViewRequest
+    request: LoadRequest
     load: LoadRequest
     displacement: Tensor
     points: Floats
     values: Floats
     quantity: str
-    answer: Answer | GraspAnswer | None
-    amplitude: float
-    iteration: int
-    residual: float
-    volume_ratio: float
-    converged: bool
+    answer: Any
 
     @property
     def grasp(self) -> GraspAnswer | None:
         """Result of a grasp; None for that of a load or an iterate of Newton."""
         return self.answer if isinstance(self.answer, GraspAnswer) else None
-
-    @property
-    def hand_force(self) -> Tensor:
-        """Forces of the hand, (N, D) [N]: those of the gripper, or the load."""
-        return self.load.force if self.grasp is None else torch.from_numpy(self.grasp.nodal_force)
 
 
 class Body:
@@ -140,39 +120,10 @@ class Body:
     def grasp(
         self, nodes: Tensor, translation: Tensor, rotation: Tensor, *, sliding: bool = False
     ) -> GraspRequest:
-        """Return the request of a grasp, with the constant force of the scene.
-
-        Args:
-            nodes: Mask of the nodes of the patch, (N,).
-            translation, rotation: See `GraspRequest`.
-            sliding: See `GraspRequest`.
-
-        Raises:
-            ValueError: The patch is empty.
-        """
-        if not nodes.any():
-            lacks = "facet across x, y or z" if sliding else "free node"
-            raise ValueError(
-                f"the patch has no {lacks} of the boundary; click another place or enlarge radius"
-            )
-        return GraspRequest(nodes, translation, rotation, self.zero_load(), sliding)
-
-    def with_moduli(
-        self, request: ViewRequest, young: float, parameters: Mapping[str, float] | None = None
-    ) -> ViewRequest:
-        """Return a request with Young's modulus [Pa] and values of the ranges of the law, by name.
-
-        Raises:
-            ValueError: A value is out of its range.
-        """
-        low, high = self.young_range
-        if not low * (1 - 1e-9) <= young <= high * (1 + 1e-9):
-            raise ValueError(f"young = {young:g} must lie between {low:g} and {high:g} Pa")
-        parameters = {**self.parameters, **(parameters or {})}
-        for name, (low, high) in self.scene.loads.parameter_ranges.items():
-            if not low <= parameters[name] <= high:
-                raise ValueError(f"{name} = {parameters[name]:g} must lie between {low} and {high}")
-        return request.with_moduli(young, parameters)
+        """Return the request of a grasp; see `GraspRequest` for the arguments."""
+        rest = self.zero_load()
+        motion = translation, rotation, sliding
+        return GraspRequest(rest.force, rest.young, rest.parameters, nodes, *motion)
 
     def sample(self, index: int) -> LoadRequest:
         """Return a random load of the training distribution."""
@@ -181,85 +132,70 @@ class Body:
         parameters = dict(zip(self.parameters, load.parameters[0].tolist(), strict=True))
         return LoadRequest(load.force[0] * young * self.scene.force_unit, young, parameters)
 
-    def solve(self, request: ViewRequest, settings: ViewSettings) -> Frame:
+    def solve(self, request: LoadRequest, settings: ViewSettings) -> Frame:
         """Return the frame of a request, computed by the simulator."""
         answer = request.answer(self.simulator, settings.tol, settings.budget_ms)
         reference: Tensor | float = 0.0
         if settings.quantity == ERROR:
-            exact = request.answer(self.simulator, self.scene.solver.tol, warm=True)
+            exact = request.answer(self.simulator, self.scene.solver.tol)
             if isinstance(exact, GraspAnswer) and exact.stopped:
                 raise ValueError(
                     f"colours: no finite-element solution of this grasp after "
                     f"{exact.milliseconds / 1e3:.1f} s; move the hand back"
                 )
             reference = torch.as_tensor(exact.displacement)
-        displacement = torch.as_tensor(answer.displacement)
-        load = request.load(answer)
-        return self._frame(request, load, settings.quantity, displacement, answer, reference)
+        u = torch.as_tensor(answer.displacement)
+        return self._frame(request, request.load(answer), u, settings.quantity, answer, reference)
 
     def newton_frames(
-        self, request: ViewRequest, settings: ViewSettings, reference: Frame
+        self, request: LoadRequest, settings: ViewSettings, reference: Frame
     ) -> Iterator[Frame]:
         """Yield the iterates of Newton from zero displacement; errors are against `reference`."""
         exact = reference.displacement if settings.quantity == ERROR else 0.0
-        load, quantity = reference.load, settings.quantity
         with one_thread():
             for state in request.newton_states(self.scene):
-                displacement = self.scene.length * state.displacement[0]
-                yield self._frame(request, load, quantity, displacement, state, exact)
+                u = self.scene.length * state.displacement[0]
+                yield self._frame(request, reference.load, u, settings.quantity, state, exact)
 
     def _frame(
         self,
-        request: ViewRequest,
+        request: LoadRequest,
         load: LoadRequest,
-        quantity: str,
         displacement: Tensor,
-        result: Answer | GraspAnswer | Solution,
+        quantity: str,
+        answer: Any,
         reference: Tensor | float,
     ) -> Frame:
         """Return the frame of displacements (N, D) [m]; values are relative to `reference`."""
         u = displacement / self.scene.length
-        answer = None if isinstance(result, Solution) else result
-        if quantity == STRESS and bool(displacement.any()):  # at rest it is zero up to rounding
+        if quantity == STRESS and bool(displacement.any()):
             with torch.inference_mode():
                 stress = self.surface.von_mises(u, load.dimensionless(self.scene).parameters)
             values = load.young * stress
-        elif quantity == STRESS:
+        elif quantity == STRESS:  # at rest it is zero up to rounding
             values = np.zeros(len(self.surface.nodes))
         else:
             values = (displacement - reference).norm(dim=1).numpy()[self.surface.nodes]
-        return Frame(
-            request,
-            load,
-            displacement,
-            self.surface.deformed_points(u),
-            values,
-            quantity,
-            answer,
-            0.0 if answer is None else request.amplitude(answer, self.scene),
-            int(result.iterations) if answer is None else -1,
-            float(result.residual),
-            float(result.volume_ratio),
-            bool(result.converged),
-        )
+        points = self.surface.deformed_points(u)
+        return Frame(request, load, displacement, points, values, quantity, answer)
 
+    def arrow_ends(self, frame: Frame) -> Floats:
+        """Return start and end of the arrow over L, (2, 3); (0, 3) if the total force is zero.
 
-def arrow_ends(surface: Surface, frame: Frame) -> Floats:
-    """Return start and end of the arrow over L, (2, 3); (0, 3) if the total force is zero.
-
-    The axis of the arrow passes through the centre of the nodal forces. The arrow starts where its
-    axis leaves the body, so that the body does not hide it; in 2D it starts at the centre.
-    """
-    force = frame.hand_force.numpy()
-    total = np.pad(force.sum(axis=0), (0, 3 - force.shape[1]))
-    sizes = np.linalg.norm(force, axis=1)
-    if not np.linalg.norm(total) > BALANCED * sizes.sum():
-        return np.zeros((0, 3))
-    direction = total / np.linalg.norm(total)
-    points = np.nan_to_num(frame.points)
-    weights = sizes[surface.nodes] if sizes[surface.nodes].any() else np.ones(len(points))
-    centre = weights @ points / weights.sum()
-    start = centre + exit_distance(points, surface.triangles, centre, direction) * direction
-    amplitude = min(max(frame.amplitude, 0.0), MAX_AMPLITUDE)
-    length = ARROW_LENGTH[0] + ARROW_LENGTH[1] * amplitude
-    return np.stack([start, start + length * direction])
+        The axis of the arrow passes through the centre of the forces of the hand. The arrow starts
+        where its axis leaves the body, so that the body does not hide it; in 2D it starts at the
+        centre.
+        """
+        surface, force = self.surface, frame.request.hand_force(frame.answer).numpy()
+        total = np.pad(force.sum(axis=0), (0, 3 - force.shape[1]))
+        sizes = np.linalg.norm(force, axis=1)
+        if not np.linalg.norm(total) > BALANCED * sizes.sum():
+            return np.zeros((0, 3))
+        direction = total / np.linalg.norm(total)
+        points = np.nan_to_num(frame.points)
+        weights = sizes[surface.nodes] if sizes[surface.nodes].any() else np.ones(len(points))
+        centre = weights @ points / weights.sum()
+        start = centre + exit_distance(points, surface.triangles, centre, direction) * direction
+        amplitude = frame.request.amplitude(frame.answer, self.scene)
+        length = ARROW_LENGTH[0] + ARROW_LENGTH[1] * min(max(amplitude, 0.0), MAX_AMPLITUDE)
+        return np.stack([start, start + length * direction])

@@ -4,7 +4,6 @@ A hand `take`s a node of the shown body, `move`s it with the mouse, and `hold`s 
 sliders say; the two latter return requests, which the worker makes.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -24,7 +23,7 @@ class _Hand:
         self._start = torch.zeros(body.scene.problem.shape[1]).double()
 
     def _patch(self, node: int) -> Patch:
-        return self._body.patch(node, self._controls.radius.value)
+        return self._body.patch(node, self._controls.radius)
 
 
 class PullingHand(_Hand):
@@ -41,27 +40,24 @@ class PullingHand(_Hand):
         `motion` is that of the mouse over L since `take`, (D,) [-].
         """
         target, controls = self._start + motion, self._controls
-        size = float(target.norm())
-        if size > 0:
+        if size := float(target.norm()):
             direction = np.pad((target / size).numpy(), (0, 3 - len(target)))
             controls.direction.value = tuple(direction.round(2).tolist())
         controls.follows_frame = True
-        return self._request(partial(self._patch(self._node).force_towards, target))
+        patch = self._patch(self._node)
+        return lambda: self._body.request(patch.force_towards(target))
 
     def hold(self, node: int, frame: Frame | None) -> MakeRequest:
         """Return the load of the sliders for direction and amplitude."""
-        self._controls.follows_frame = False
-        direction = torch.tensor(self._controls.direction.value[: len(self._start)]).double()
-        amplitude = self._controls.amplitude.value
-        return self._request(partial(self._patch(node).force_along, direction, amplitude))
+        patch, controls = self._patch(node), self._controls
+        controls.follows_frame = False
+        direction = torch.tensor(controls.direction.value[: len(self._start)]).double()
+        amplitude = controls.amplitude.value
+        return lambda: self._body.request(patch.force_along(direction, amplitude))
 
     def marked_nodes(self, node: int) -> Tensor:
         """Mask of the loaded nodes, (N,)."""
         return self._patch(node).node_mask
-
-    def _request(self, make_force: Callable[[], Tensor]) -> MakeRequest:
-        """Return the request of a dimensionless force (N, D)."""
-        return lambda: self._body.request(make_force())
 
 
 class GraspingHand(_Hand):
@@ -70,15 +66,15 @@ class GraspingHand(_Hand):
     def __init__(self, body: Body, controls: Controls) -> None:
         """Store the body and the controls of the patch."""
         super().__init__(body, controls)
-        self._node: int | None = None  # at the centre of the held patch
+        self._held: int | None = None  # node at the centre of the held patch
         self._translation = self._start
 
     def take(self, node: int, frame: Frame) -> int:
         """Hold the patch of the node; a drag within the held patch keeps it."""
-        if self._node is None or not self._patch(self._node).node_mask[node]:
+        if self._held is None or not self._patch(self._held).node_mask[node]:
             self._grip(node, frame)
         self._start = self._translation
-        return node if self._node is None else self._node
+        return node if self._held is None else self._held
 
     def move(self, motion: Tensor) -> MakeRequest:
         """Return the grasp whose translation is that at `take` plus the motion."""
@@ -87,13 +83,13 @@ class GraspingHand(_Hand):
 
     def hold(self, node: int, frame: Frame | None) -> MakeRequest:
         """Return the grasp of the patch of a node, rotated by the angle of the slider."""
-        if node != self._node:
+        if node != self._held:
             self._grip(node, frame)
         return self._request()
 
     def release(self) -> None:
         """Forget the patch, because another load replaces the request."""
-        self._node = None
+        self._held = None
 
     def marked_nodes(self, node: int) -> Tensor:
         """Mask of the held nodes, (N,)."""
@@ -106,13 +102,12 @@ class GraspingHand(_Hand):
         self._translation = torch.zeros_like(self._translation)
         if frame is not None and held.any():
             self._translation = frame.displacement[held].mean(dim=0) / self._body.scene.length
-        self._node, self._controls.angle.value = node, 0.0
+        self._held, self._controls.angle.value = node, 0.0
 
     def _request(self) -> MakeRequest:
         """Return the request of the held patch with the rotation of the controls."""
-        assert self._node is not None
-        controls = self._controls
-        controls.follows_frame = False
-        nodes, sliding = self.marked_nodes(self._node), bool(controls.sliding.value)
-        motion = self._translation, controls.rotation
+        assert self._held is not None
+        self._controls.follows_frame = False
+        nodes, sliding = self.marked_nodes(self._held), bool(self._controls.sliding.value)
+        motion = self._translation, self._controls.rotation
         return partial(self._body.grasp, nodes, *motion, sliding=sliding)

@@ -4,6 +4,7 @@ import contextlib
 import io
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,24 @@ from typing import Any
 import numpy as np
 import torch
 import viser
+from torch import Tensor
 
-from dpl.viewer.access import AccessPolicy, check_server, serve_with
+from dpl.viewer.access import AccessPolicy, serve_with
 from dpl.viewer.camera import UP, Placement
-from dpl.viewer.controls import BAD, GOOD, GRASP, WARNING, Controls, problem_of
+from dpl.viewer.controls import (
+    BAD,
+    GOOD,
+    GRASP,
+    Controls,
+    message,
+    newton_table,
+    problem_of,
+)
 from dpl.viewer.frames import Body, Frame
 from dpl.viewer.hands import GraspingHand, PullingHand
 from dpl.viewer.nodes import BodyNode, LoadMarker, LocalServer, add_environment
-from dpl.viewer.recording import SUFFIXES, Recording, farthest_node, rotating_load
-from dpl.viewer.renderer import ColourScale
+from dpl.viewer.recording import MAX_FRAMES, SUFFIXES, Recording, farthest_node, rotating_load
+from dpl.viewer.renderer import colour_top
 from dpl.viewer.requests import LoadRequest, MakeRequest
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
@@ -53,29 +63,29 @@ class Page:
         self.body, self.folder, self._policy = body, folder, policy
         with serve_with(policy), contextlib.redirect_stdout(io.StringIO()):
             self.server = LocalServer(policy.host, policy.port, label="dpl", verbose=False)
-        self.recording, self._scale = Recording(body), ColourScale()
+        self.recording, self._top = Recording(body), 0.0
         self.frame: Frame | None = None
         self.newton_frame: Frame | None = None
-        self._error, self._changed = "", False
-        self._make_request: MakeRequest = body.zero_load
+        self._error, self._changed, self._is_slow = "", False, False
         self.node = farthest_node(body)
         self._rotating: Callable[[float], LoadRequest] | None = rotating_load(body)
         self._grabbed: Floats | None = None  # position of the mouse at the start of a drag
         self._n_samples = 0
         self.worker = Worker(body, self._show, self._show_newton, self._show_error)
-        try:
-            check_server(policy)
-        except BaseException:
-            self.close()
-            raise
         self.controls = Controls(self.server, body, title, folder)
         self._pulling = PullingHand(body, self.controls)
         self._grasping = GraspingHand(body, self.controls)
-        self.placement = Placement.of(body, self.node, self.controls.radius.value)
-        self._build_scene()
+        self.placement = Placement.of(body, self.node, self.controls.radius)
+        add_environment(self.server, self.placement, body.surface.undeformed)
+        self._body_node = BodyNode(self.server, "/body", body, "selected method")
+        self._newton_node = BodyNode(self.server, "/newton", body, "Newton from zero")
+        for node in (self._body_node, self._newton_node):
+            node.label.position = self.placement.label
+        self._newton_node.frame.position = self.placement.offset
+        self._newton_node.frame.visible = self._body_node.label.visible = False
+        self._marker = LoadMarker(self.server, body)
         self._connect()
-        self._marker.mask = self._rotating(1.0).force.any(dim=1).numpy()[body.surface.nodes]
-        self.worker.submit(settings=self.controls.settings())
+        self._mark(self._rotating(1.0).force.any(dim=1))
         self.worker.start()
 
     @property
@@ -94,28 +104,19 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
-    def _build_scene(self) -> None:
-        server, surface = self.server, self.body.surface
-        add_environment(server, self.placement, surface)
-        self._body_node = BodyNode(server, "/body", surface, "selected method")
-        self._body_node.label.visible = False
-        self._newton_node = BodyNode(server, "/newton", surface, "Newton from zero")
-        self._newton_node.frame.position = self.placement.offset
-        self._newton_node.frame.visible = False
-        self._marker = LoadMarker(server, surface)
-
     def _connect(self) -> None:
         """Connect the events of the browser with the methods below."""
         controls, catch = self.controls, self._policy.log.catch_errors
         self._marker.drag_mesh.on_drag("left")(catch(self.drag))
         self._marker.drag_mesh.on_click(catch(self.click))
-        for control, callback in (
-            *((control, self.apply_controls) for control in controls.of_load),
-            *((control, self._apply_moduli) for control in controls.of_moduli),
-            *((control, self.apply_settings) for control in controls.of_settings),
-            (controls.mode, self.apply_mode),
+        for widgets, callback in (
+            (controls.of_load, self.apply_controls),
+            (controls.of_moduli, self._apply_moduli),
+            (controls.of_settings, self.apply_settings),
+            ((controls.mode,), self.apply_mode),
         ):
-            control.on_update(catch(callback))
+            for widget in widgets:
+                widget.on_update(catch(callback))
         for button, callback in (
             *((controls.sample, self.sample), (controls.reset, self.reset)),
             *((controls.record, self._toggle_recording), (controls.save, self._save)),
@@ -181,7 +182,7 @@ class Page:
         self.controls.follows_frame = True
         self._grasping.release()
         self._submit(lambda: request)
-        self._marker.mask = request.force.any(dim=1).numpy()[self.body.surface.nodes]
+        self._mark(request.force.any(dim=1))
         self.node = self.body.surface.middle_node(self._marker.mask)
 
     def reset(self, event: Any) -> None:
@@ -196,7 +197,7 @@ class Page:
         """Solve and show the same request with the selected method and quantity."""
         old, settings = self.worker.settings, self.controls.settings()
         if settings.quantity != old.quantity:
-            self._scale = ColourScale()
+            self._top = 0.0
         if (visible := settings.show_newton) != old.show_newton:
             self._newton_node.frame.visible = self._body_node.label.visible = visible
             self.fit(None)
@@ -220,50 +221,61 @@ class Page:
             client.camera.look_at = camera.look_at
 
     def _toggle_recording(self, event: Any) -> None:
-        (self.recording.stop if self.recording.running else self.recording.start)()
+        if self.recording.running:
+            self.recording.running = False
+        else:
+            self.recording.start()
         self._changed = True
 
     def _save(self, event: Any) -> None:
         """Write the recording into the folder; send animations to the browser too."""
-        self.recording.stop()
+        recording, state = self.recording, self.controls.state
+        recording.running = False
         suffix = SUFFIXES[event.target.value]  # no part of a path comes from the browser
-        self.controls.show_state(f"Writing {len(self.recording)} frames ...")
+        state.content = message(f"Writing {len(recording.frames)} frames ...")
         try:
             if suffix == ".pvd":
-                path = self.recording.save_series(self.folder)
+                path = recording.save_series(self.folder)
             else:
-                path = self.recording.save_animation(self.folder, suffix)
+                path = recording.save_animation(self.folder, suffix)
                 if event.client is not None:
                     event.client.send_file_download(path.name, path.read_bytes())
-            self.controls.show_state(f"Written: {path}", GOOD)
+            state.content = message(f"Written: {path}", GOOD)
         except (ValueError, OSError) as error:
-            self.controls.show_state(str(error), BAD)
+            state.content = message(str(error), BAD)
 
     # --- requests to the worker and its results
 
-    def _submit(self, make_request: MakeRequest | None = None) -> None:
+    def _submit(self, make: MakeRequest | None = None) -> None:
         """Submit a request of the user, or the last one; it ends the rotation of the load."""
         self._rotating = None
         self._mark_patch()  # first, so that it does not remove an error of this request
-        self._solve(make_request or self._make_request)
+        self.worker.submit(make and self._with_moduli(make))
 
-    def _solve(self, make: MakeRequest) -> None:
-        """Submit a request with the moduli of the sliders."""
-        self._make_request, young = make, self.controls.modulus
-        parameters = {name: slider.value for name, slider in self.controls.parameters.items()}
-        self.worker.submit(lambda: self.body.with_moduli(make(), young, parameters))
+    def _with_moduli(self, make: MakeRequest) -> MakeRequest:
+        """Return a function that makes a request with the moduli of the sliders."""
+        controls = self.controls
+
+        def make_with_moduli() -> LoadRequest:
+            parameters = {name: slider.value for name, slider in controls.parameters.items()}
+            return replace(make(), young=controls.modulus, parameters=parameters)
+
+        return make_with_moduli
 
     def _mark_patch(self) -> None:
         """Mark the nodes of the patch and remove the error message."""
-        marked = self.hand.marked_nodes(self.node).numpy()
-        self._marker.mask = marked[self.body.surface.nodes]
+        self._mark(self.hand.marked_nodes(self.node))
         self._error = ""
+
+    def _mark(self, nodes: Tensor) -> None:
+        """Mark the nodes of a mask, (N,)."""
+        self._marker.mask = nodes.numpy()[self.body.surface.nodes]
 
     def _show(self, frame: Frame) -> None:
         """Show a frame; runs in the thread of the worker."""
         self.frame, self._changed, self._error = frame, True, ""
-        top, edges = self._scale.update(frame.values), self.controls.edges.value
-        self._body_node.show(frame, top, edges=edges)
+        self._top = colour_top(frame.values, self._top)
+        self._body_node.show(frame, self._top, edges=self.controls.edges.value)
         self._marker.show(frame)
         self.server.flush()  # viser would otherwise wait for its next update interval
         self.recording.add(frame, time.monotonic())
@@ -272,7 +284,7 @@ class Page:
         """Show an iterate of Newton; runs in the thread of the worker."""
         self.newton_frame, self._changed = frame, True
         if frame is not None:
-            self._newton_node.show(frame, self._scale.top, edges=self.controls.edges.value)
+            self._newton_node.show(frame, self._top, edges=self.controls.edges.value)
 
     def _show_error(self, text: str) -> None:
         self._error, self._changed = text, True
@@ -283,18 +295,24 @@ class Page:
         Until a user changes the load, it rotates while a browser shows the page.
         """
         if self._rotating and self.server.get_clients():
-            self._solve(partial(self._rotating, time.monotonic()))
-        if (seconds := self.worker.solving_time) > SLOW:
-            self.controls.show_problem(f"Solving for {seconds:.0f} s ...", WARNING)
-            self._changed = True
-        elif self._changed and self.frame is not None:
-            self._show_readings(self.frame)
+            self.worker.submit(self._with_moduli(partial(self._rotating, time.monotonic())))
+        seconds, is_slow = self.worker.solving_time, self._is_slow
+        self._is_slow = seconds > SLOW
+        if self._is_slow or is_slow or self._changed:
+            self._changed = False
+            self._show_readings(f"Solving for {seconds:.0f} s ..." if self._is_slow else "")
 
-    def _show_readings(self, frame: Frame) -> None:
-        """Show the readings of a frame, or why it cannot be used."""
-        self._changed = False
-        self.controls.show_frame(frame, self._scale.top, self.node)
-        self.controls.show_newton_frame(self.newton_frame, self.worker.settings.show_newton)
-        has_budget = self.worker.settings.budget_ms is not None
-        self.controls.show_problem(self._error or problem_of(frame, has_budget=has_budget))
-        self.controls.show_recording(self.recording)
+    def _show_readings(self, progress: str) -> None:
+        """Show the readings of the last frame, and the progress or why it cannot be used."""
+        frame, settings, controls = self.frame, self.worker.settings, self.controls
+        problem = self._error
+        if frame is not None and not problem:
+            problem = problem_of(frame, has_budget=settings.budget_ms is not None)
+        below = newton_table(self.newton_frame) if settings.show_newton else ""
+        below += message(progress) if progress else message(problem, BAD)
+        if frame is None:
+            controls.readings.content = below
+        else:
+            controls.show_frame(frame, self._top, self.node, below)
+        count = f"Stop ({len(self.recording.frames)} of {MAX_FRAMES} frames)"
+        controls.record.label = count if self.recording.running else "Start recording"

@@ -1,15 +1,14 @@
 """Recordings of frames: series for ParaView and animations, and one of a rotating load."""
 
 import math
-import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.colors import to_rgb
 from PIL import Image
 
 from dpl.evaluation.nodal_fields import nodal_fields
@@ -18,15 +17,7 @@ from dpl.fem.mesh import write_collection
 from dpl.inference.answer import relative
 from dpl.system.files import atomic_write
 from dpl.viewer.frames import STRESS, Body, Frame, ViewSettings
-from dpl.viewer.renderer import (
-    ARROW_COLOUR,
-    BACKGROUND,
-    NEUTRAL,
-    TEXT,
-    ColourScale,
-    Renderer,
-    band_colours,
-)
+from dpl.viewer.renderer import Renderer, colour_top
 from dpl.viewer.requests import LoadRequest
 
 MAX_FRAMES = 900  # frames of a recording, 30 s at 30 frames per second
@@ -44,39 +35,25 @@ class Recording:
     Attributes:
         body: The body.
         running: True while frames are recorded.
+        frames: Times from the first frame on [s], and frames.
     """
 
     def __init__(self, body: Body) -> None:
         """Create an empty recording."""
         self.body, self.running = body, False
-        self._frames: list[tuple[float, Frame]] = []
-        self._lock = threading.Lock()
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self._frames)
+        self.frames: list[tuple[float, Frame]] = []
+        self._begin = 0.0
 
     def start(self) -> None:
         """Remove all frames and start recording."""
-        with self._lock:
-            self._frames, self.running = [], True
-
-    def stop(self) -> None:
-        """Stop recording."""
-        self.running = False
+        self.frames, self.running = [], True
 
     def add(self, frame: Frame, time: float) -> None:
         """Append a frame that is shown at a time [s]; ignored if stopped or full."""
-        with self._lock:
-            if self.running and len(self._frames) < MAX_FRAMES:
-                self._frames.append((time, frame))
-            self.running &= len(self._frames) < MAX_FRAMES
-
-    def frames(self) -> list[tuple[float, Frame]]:
-        """Return times [s] from the first frame on, and frames."""
-        with self._lock:
-            frames = list(self._frames)
-        return [(time - frames[0][0], frame) for time, frame in frames]
+        if self.running:
+            self._begin = self._begin if self.frames else time
+            self.frames.append((time - self._begin, frame))
+            self.running = len(self.frames) < MAX_FRAMES
 
     def save_series(self, folder: Path) -> Path:
         """Write VTU files with `nodal_fields` and a PVD file; return the path of the PVD file.
@@ -87,7 +64,7 @@ class Recording:
         scene = self.body.scene
         path = self._free_path(folder, ".pvd")
         files = []
-        for number, (time, frame) in enumerate(self.frames()):
+        for number, (time, frame) in enumerate(self.frames):
             load = frame.load.dimensionless(scene)
             with torch.inference_mode():
                 fields = nodal_fields(scene, load, frame.displacement / scene.length)
@@ -106,14 +83,21 @@ class Recording:
             ValueError: The recording is empty, or the format is unknown.
         """
         path = self._free_path(folder, suffix)
-        frames = resample(self.frames())
-        renderer = Renderer.fitting(self.body.surface, frames, size)
-        write_animation(path, frames, renderer, default_captions)
+        frames = resample(self.frames)
+        renderer = Renderer.fitting(self.body, frames, size)
+
+        def captions(frame: Frame) -> list[str]:
+            answer = frame.answer
+            error, method = relative(float(answer.error)), answer.method
+            time, ratio = f"{answer.milliseconds:.1f} ms", f"{answer.volume_ratio:.2f}"
+            return [f"estimated error {error}", f"{method}, {time}", f"min det F {ratio}"]
+
+        write_animation(path, frames, renderer, captions)
         return path
 
     def _free_path(self, folder: Path, suffix: str) -> Path:
         """Return the first unused path of recording-001, ..., with and without the suffix."""
-        if not self._frames:
+        if not self.frames:
             raise ValueError("the recording is empty; start recording first")
         for number in range(1, 10_000):
             path = folder / f"recording-{number:03d}{suffix}"
@@ -130,47 +114,30 @@ def resample(frames: list[tuple[float, Frame]]) -> list[Frame]:
     return [frames[k][1] for k in chosen]
 
 
-def default_captions(frame: Frame) -> list[str]:
-    """Return the lines of text for a frame of a recording."""
-    answer = frame.answer
-    assert answer is not None
-    return [
-        f"estimated error {relative(float(answer.error))}",
-        f"{answer.method}, {answer.milliseconds:.1f} ms",
-        f"min det F {frame.volume_ratio:.2f}",
-    ]
-
-
 def write_animation(
     path: Path, frames: list[Frame], renderer: Renderer, captions: Callable[[Frame], list[str]]
 ) -> None:
-    """Write frames, `FRAME_RATE` per second, as an animation; a GIF loops.
+    """Write frames, `FRAME_RATE` per second, with one colour scale as an animation; a GIF loops.
 
     Raises:
         ValueError: The path does not end with one of `FORMATS`.
     """
     if path.suffix not in FORMATS:
         raise ValueError(f"path = {path.name} must end with {' or '.join(FORMATS)}")
-    images = _render(frames, renderer, captions)
+    top = colour_top(np.concatenate([frame.values for frame in frames]))
+    images = (
+        image
+        for _, (frame, *again) in groupby(frames, key=id)
+        for image in [renderer.render(frame, top, captions(frame))] * (1 + len(again))
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
         _write_mp4(path, images, renderer.size)
-    else:
-        _write_gif(path, images, {frame.quantity for frame in frames})
-
-
-def _render(
-    frames: list[Frame], renderer: Renderer, captions: Callable[[Frame], list[str]]
-) -> Iterator[Image.Image]:
-    """Yield the images of frames with one colour scale for all."""
-    top = ColourScale().update(np.concatenate([frame.values for frame in frames]))
-    for _, (frame, *again) in groupby(frames, key=id):
-        image = renderer.render(frame, top, captions(frame))
-        yield from [image] * (1 + len(again))
-
-
-def _write_gif(path: Path, images: Iterator[Image.Image], quantities: set[str]) -> None:
-    palette = _palette(quantities)
+        return
+    # with a common palette, unchanged pixels take no space and do not flicker
+    some = [renderer.render(one, top, captions(one)) for one in frames[:: len(frames) // 3 + 1]]
+    colours = Image.fromarray(np.concatenate([np.asarray(image) for image in some]))
+    palette = colours.quantize(256, Image.Quantize.MAXCOVERAGE)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     options: dict[str, Any] = {"duration": round(1000 / FRAME_RATE), "loop": 0, "optimize": False}
     with atomic_write(path) as file:
@@ -193,50 +160,27 @@ def _write_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int])
         part.unlink(missing_ok=True)
 
 
-def _palette(quantities: set[str]) -> Image.Image:
-    """Return one palette for all images: shades of the band colours, of the arrow and of grey.
-
-    With a common palette, unchanged pixels take no space and do not flicker.
-    """
-    shades = np.linspace(0.45, 1.05, 16 // len(quantities))[:, None, None]
-    bands = [np.clip(shades * band_colours(quantity), 0, 255) for quantity in sorted(quantities)]
-    greys = 255 * np.linspace(to_rgb(BACKGROUND), to_rgb(TEXT), 40)
-    reds = np.linspace(ARROW_COLOUR, (255, 255, 255), 8)
-    neutral = np.clip(np.linspace(0.45, 1.05, 16)[:, None] * NEUTRAL, 0, 255)
-    parts = (*(shade.reshape(-1, 3) for shade in bands), greys, reds, neutral)
-    colours = np.concatenate(parts).round()
-    image = Image.new("P", (1, 1))
-    image.putpalette(colours.astype(np.uint8).tobytes())
-    return image
-
-
 def animate_load(body: Body, path: Path, *, size: tuple[int, int] = (720, 405)) -> None:
-    """Write a looping animation of `circular_load`, with the von Mises stress as colours.
+    """Write a looping animation of `rotating_load`, with the von Mises stress as colours.
 
-    The caption has the largest error of the displacement against finite elements, and the median
-    time. `path` ends with .gif or .mp4; `size` is width and height [pixel].
+    The caption has the largest error of `sim(force)` against finite elements, and its median time.
+    `path` ends with .gif or .mp4; `size` is width and height [pixel].
     """
-    frames, errors = circular_load(body), []
-    exact = ViewSettings(tol=body.scene.solver.tol)
+    request_at, errors = rotating_load(body), []
+    times = np.arange(DURATION * FRAME_RATE) / FRAME_RATE
+    frames = [body.solve(request_at(time), ViewSettings(quantity=STRESS)) for time in times]
     for frame in frames:
-        reference = body.solve(frame.request, exact).displacement
-        apart = (frame.displacement - reference).norm() / reference.norm().clamp(min=1e-300)
+        exact = body.solve(frame.request, ViewSettings(tol=body.scene.solver.tol)).displacement
+        apart = (frame.displacement - exact).norm() / exact.norm().clamp(min=1e-300)
         errors.append(float(apart))
-    median = float(np.median([frame.answer.milliseconds for frame in frames if frame.answer]))
+    median = np.median([frame.answer.milliseconds for frame in frames])
     captions = [
         f"error at most {relative(max(errors))}",
         f"sim(force): {median:.1f} ms",
         f"{math.prod(body.scene.problem.shape):,} degrees of freedom",
     ]
-    renderer = Renderer.fitting(body.surface, frames, size)
+    renderer = Renderer.fitting(body, frames, size)
     write_animation(path, frames, renderer, lambda frame: captions)
-
-
-def circular_load(body: Body) -> list[Frame]:
-    """Return the answers of `sim(force)` for one turn of `rotating_load`."""
-    request_at, settings = rotating_load(body), ViewSettings(quantity=STRESS)
-    times = np.arange(DURATION * FRAME_RATE) / FRAME_RATE
-    return [body.solve(request_at(time), settings) for time in times]
 
 
 def rotating_load(body: Body) -> Callable[[float], LoadRequest]:
@@ -259,14 +203,13 @@ def rotating_load(body: Body) -> Callable[[float], LoadRequest]:
         return body.request(patch.force_towards(target))
 
     tried = [body.solve(rotated(DURATION * k / 8), ViewSettings()).answer for k in range(1, 4)]
-    if all(found and not found.out_of_distribution and found.out_of_span >= 0 for found in tried):
+    if all(not found.out_of_distribution and found.out_of_span >= 0 for found in tried):
         return rotated
     samples = [body.solve(body.sample(index), ViewSettings()) for index in range(SAMPLES)]
     largest = max(samples, key=lambda frame: float(frame.displacement.norm())).load
     rest, force = body.zero_load(), largest.force * (body.young / largest.young)
-    return lambda time: rest._replace(
-        force=torch.lerp(rest.force, force, math.sin(math.pi * time / DURATION) ** 2)
-    )
+    goal = replace(rest, force=force)
+    return lambda time: rest.interpolate(goal, math.sin(math.pi * time / DURATION) ** 2)
 
 
 def farthest_node(body: Body) -> int:

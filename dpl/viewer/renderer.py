@@ -8,18 +8,18 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
-from matplotlib.colors import to_rgba_array
+from matplotlib.colors import ListedColormap, Normalize, to_rgba_array
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch
+from matplotlib.ticker import EngFormatter, FuncFormatter
 from numpy.typing import NDArray
 from PIL import Image
 
 from dpl.fem.postprocess import triangle_normals
 from dpl.viewer.camera import Camera
-from dpl.viewer.frames import QUANTITIES, Frame, arrow_ends
+from dpl.viewer.frames import QUANTITIES, Body, Frame
 from dpl.viewer.surface import Floats, Surface, contour_bands, vertex_normals
-from dpl.viewer.units import tick_labels
 
 COLOUR_MAPS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
 MARGINS = (0.03, 0.13, 0.05, 0.17)  # margins for legend (right) and captions (above) [-]
@@ -30,6 +30,11 @@ NEUTRAL = (188, 194, 204)  # colour of a body at rest
 GRAZING = -0.2  # smallest distance of the camera above a visible face, over L
 BACKGROUND, TEXT, TEXT_GREY, OUTLINE = "#fafafc", "#202430", "#464a58", "#cdd1da"
 ARROW_COLOUR, SUPPORT_COLOUR = (200, 24, 45), (71, 85, 105)
+ARROW: dict[str, Any] = {
+    "arrowstyle": "simple,tail_width=0.22,head_width=0.8,head_length=0.8",
+    **{"mutation_scale": 20, "shrinkA": 0, "shrinkB": 0, "linewidth": 0.6},
+    **{"facecolor": np.array(ARROW_COLOUR) / 255, "edgecolor": "white"},
+}
 Bytes = NDArray[np.uint8]
 
 
@@ -48,24 +53,20 @@ def colour_bands(surface: Surface, frame: Frame, top: float) -> list[Floats]:
     return contour_bands(np.nan_to_num(frame.points), surface.triangles, levels, N_BANDS)
 
 
-class ColourScale:
-    """Colour scale from 0 to a rounded maximum that changes only with large changes of the values.
+def colour_top(values: Floats, before: float = 0.0) -> float:
+    """Return the upper end of a colour scale that starts at 0 and contains values.
 
-    Attributes:
-        top: Upper end; 0 before the first values.
+    It is a rounded number, and stays as `before` unless the values are larger or far smaller.
+    Values that are not finite are ignored.
     """
+    largest = float(values[np.isfinite(values)].max(initial=0.0))
+    return before if 0.4 * before <= largest <= before else round_up(largest)
 
-    def __init__(self) -> None:
-        """Start without an upper end."""
-        self.top = 0.0
 
-    def update(self, values: Floats) -> float:
-        """Return the upper end for values; values that are not finite are ignored."""
-        finite = values[np.isfinite(values)]
-        largest = float(finite.max()) if len(finite) else 0.0
-        if largest > self.top or largest < 0.4 * self.top:
-            self.top = round_up(largest)
-        return self.top
+def engineering(value: float, unit: str) -> str:
+    """Return a value with three digits and its unit, such as "1.25 kN" for 1250 and "N"."""
+    rounded = float(f"{value:.2e}")
+    return EngFormatter(unit).format_data(rounded) if math.isfinite(value) else f"{value} {unit}"
 
 
 def round_up(number: float) -> float:
@@ -82,29 +83,30 @@ class Renderer:
     """Renderer of images of one body.
 
     Attributes:
-        surface: Surface of the body.
+        body: The body.
         camera: The camera.
         size: Width and height of images [pixel].
     """
 
-    surface: Surface
+    body: Body
     camera: Camera
     size: tuple[int, int] = (960, 540)
 
     @classmethod
     def fitting(
-        cls, surface: Surface, frames: Sequence[Frame], size: tuple[int, int] = (960, 540)
+        cls, body: Body, frames: Sequence[Frame], size: tuple[int, int] = (960, 540)
     ) -> "Renderer":
         """Return a renderer whose camera shows the body at rest and in all frames, with arrows."""
+        surface = body.surface
         points = np.concatenate([
+            surface.supports(surface.undeformed).reshape(-1, 3),
             surface.undeformed,
-            surface.supports.vertices(surface.undeformed),
             *(np.nan_to_num(frame.points) for frame in frames[:: len(frames) // MAX_FITTED + 1]),
-            *(arrow_ends(surface, frame) for frame in frames),
+            *(body.arrow_ends(frame) for frame in frames),
         ])  # fmt: skip
         aspect = size[0] / size[1]
         camera = Camera.fit(points, planar=surface.planar, aspect=aspect, margins=MARGINS)
-        return cls(surface, camera, size)
+        return cls(body, camera, size)
 
     def render(self, frame: Frame, top: float, captions: Sequence[str]) -> Image.Image:
         """Return the image of a frame with the arrow of its load, a legend and lines of text.
@@ -118,8 +120,9 @@ class Renderer:
         ax = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
         ax.set_axis_off()
         ax.add_collection(self._polygons(frame, top))
-        if len(ends := arrow_ends(self.surface, frame)):
-            ax.add_patch(self._arrow(ends))
+        if len(ends := self.body.arrow_ends(frame)):
+            start, end = self.camera.project(ends, *self.size)[:, :2]
+            ax.annotate("", end, start, arrowprops=ARROW)
         _draw_captions(figure, captions)
         if top > 0:
             _draw_legend(figure, frame.quantity, top)
@@ -128,12 +131,12 @@ class Renderer:
 
     def _polygons(self, frame: Frame, top: float) -> PolyCollection:
         """Return triangles, supports and edges from far to near, those that face away first."""
-        surface, camera, points = self.surface, self.camera, np.nan_to_num(frame.points)
+        surface, camera, points = self.body.surface, self.camera, np.nan_to_num(frame.points)
         bands = colour_bands(surface, frame, top)
         soup = np.concatenate(bands)
         counts = [len(band) // 3 for band in bands]
         colours = np.repeat(band_colours(frame.quantity, top), counts, axis=0)
-        symbols = surface.supports.vertices(points)[surface.supports.triangles].reshape(-1, 3)
+        symbols = surface.supports(points).reshape(-1, 3)
         edges = points[surface.feature_edges]
         sides = vertex_normals(points, surface.triangles)[surface.feature_edges].mean(axis=1)
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
@@ -168,22 +171,6 @@ class Renderer:
         shades = np.clip(colours * brightness[:, None], 0, 255) / 255
         return soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1)
 
-    def _arrow(self, ends: Floats) -> FancyArrowPatch:
-        """Return the arrow of the load, in front of the body."""
-        start, end = self.camera.project(ends, *self.size)[:, :2]
-        return FancyArrowPatch(
-            tuple(start),
-            tuple(end),
-            arrowstyle="simple,tail_width=0.22,head_width=0.8,head_length=0.8",
-            mutation_scale=20,
-            shrinkA=0,
-            shrinkB=0,
-            facecolor=np.array(ARROW_COLOUR) / 255,
-            edgecolor="white",
-            linewidth=0.6,
-            zorder=3,
-        )
-
 
 def _draw_captions(figure: Figure, captions: Sequence[str]) -> None:
     """Draw the first caption as a title in the upper left corner, and the others below it."""
@@ -198,11 +185,10 @@ def _draw_legend(figure: Figure, quantity: str, top: float) -> None:
     """Draw the colour bar at the right edge."""
     width, height = figure.get_size_inches()
     bar = figure.add_axes((1 - 0.92 / width, 0.6 / height, 0.18 / width, 1 - 1.8 / height))
-    bar.imshow(band_colours(quantity)[::-1, None], aspect="auto", extent=(0, 1, 0, N_BANDS))
-    unit, _, labels = tick_labels(top, QUANTITIES[quantity])
-    ticks = np.linspace(0, N_BANDS, len(labels))
-    bar.set(xticks=[], yticks=ticks, yticklabels=labels, frame_on=False)
-    bar.yaxis.tick_right()
+    unit, colours = QUANTITIES[quantity], ListedColormap(band_colours(quantity) / 255)
+    scale, ticks = ScalarMappable(Normalize(0, top), colours), np.linspace(0, top, 5).tolist()
+    labels = FuncFormatter(lambda value, _: engineering(value, unit))
+    figure.colorbar(scale, cax=bar, ticks=ticks, format=labels).outline.set_visible(False)
     bar.tick_params(length=0, labelsize=10, labelcolor=TEXT_GREY)
     place = 1 - 0.22 / width, 1 - 0.98 / height
-    figure.text(*place, f"{quantity} [{unit}]", color=TEXT, size=10, ha="right", va="center")
+    figure.text(*place, quantity, color=TEXT, size=10, ha="right", va="center")

@@ -1,10 +1,11 @@
 """Patches of the body, and requests of the page: a load, or the grasp of a patch."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,15 +49,15 @@ class Patch:
     @cached_property
     def sliding_nodes(self) -> Tensor:
         """Mask of the nodes that are held while the patch slides, (N,); none if it cannot."""
-        problem = self.scene.problem
+        linear, held, directions = (
+            self.scene.linear,
+            self.held_nodes,
+            [True] * self.scene.problem.shape[1],
+        )
         try:
-            directions = [True] * problem.shape[1]
-            held = RigidPatch.of(
-                self.scene.linear, self.held_nodes.numpy(), directions, sliding=True
-            )
+            return RigidPatch.of(linear, held.numpy(), directions, sliding=True).nodes
         except ValueError:
-            return torch.zeros_like(self.held_nodes)
-        return held.nodes
+            return torch.zeros_like(held)
 
     @cached_property
     def unit_loads(self) -> Tensor:
@@ -106,7 +107,8 @@ class Patch:
         return amplitude * self.force_towards(far)
 
 
-class LoadRequest(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class LoadRequest:
     """A load in SI units.
 
     Attributes:
@@ -115,26 +117,28 @@ class LoadRequest(NamedTuple):
         parameters: Value of each range of the law, by name.
     """
 
+    varying: ClassVar[tuple[str, ...]] = ("force", "young")  # between two frames
     force: Tensor
     young: float
     parameters: Mapping[str, float]
 
-    @property
-    def coordinates(self) -> Tensor:
-        """The forces, by which the page interpolates between loads."""
-        return self.force.flatten()
-
-    def continues(self, other: "ViewRequest") -> bool:
+    def continues(self, other: "LoadRequest") -> bool:
         """Return True if the page interpolates from another request to this one."""
-        return isinstance(other, LoadRequest)
+        return type(self) is type(other)
 
-    def at(self, coordinates: Tensor) -> "LoadRequest":
-        """Return the load with other forces."""
-        return self._replace(force=coordinates.view_as(self.force))
+    def interpolate(self, goal: Self, share: float) -> Self:
+        """Return the request at a share of the way from this one (0) to a goal (1)."""
+        between = {n: a + share * (b - a) for n, a, b in self._pairs(goal)}
+        return replace(goal, **between)
 
-    def with_moduli(self, young: float, parameters: Mapping[str, float]) -> "LoadRequest":
-        """Return the load on a body with another modulus [Pa] and other parameters of the law."""
-        return self._replace(young=young, parameters=parameters)
+    def distance(self, goal: Self) -> float:
+        """Return the largest change on the way to a goal, over the larger of the two values [-]."""
+        norm = np.linalg.norm
+        changes = [norm(b - a) / (max(norm(a), norm(b)) or 1.0) for _, a, b in self._pairs(goal)]
+        return float(max(changes))
+
+    def _pairs(self, goal: Self) -> list[tuple[str, Any, Any]]:
+        return [(name, getattr(self, name), getattr(goal, name)) for name in self.varying]
 
     def dimensionless(self, scene: Scene) -> Load:
         """Return the load of the mechanics, with B = 1."""
@@ -143,28 +147,23 @@ class LoadRequest(NamedTuple):
         return scene.load_of(self.force[None], young, parameters)
 
     def answer(
-        self,
-        simulator: Simulator,
-        tol: float | None,
-        budget_ms: float | None = None,
-        *,
-        warm: bool = False,
-    ) -> Answer:
+        self, simulator: Simulator, tol: float | None, budget_ms: float | None = None
+    ) -> Answer | GraspAnswer:
         """Return the answer of a simulator; see `Simulator` for the arguments."""
+        parameters = self.parameters
         return simulator(
-            self.force,
-            young=self.young,
-            tol=tol,
-            budget_ms=budget_ms,
-            warm=warm,
-            parameters=self.parameters,
+            self.force, young=self.young, parameters=parameters, tol=tol, budget_ms=budget_ms
         )
 
-    def load(self, answer: Answer | GraspAnswer) -> "LoadRequest":
-        """Return the load on the body."""
+    def hand_force(self, answer: Any) -> Tensor:
+        """Return the forces of the hand, (N, D) [N], in an answer."""
+        return self.force
+
+    def load(self, answer: Any) -> "LoadRequest":
+        """Return the load on the body in an answer."""
         return self
 
-    def amplitude(self, answer: Answer | GraspAnswer, scene: Scene) -> float:
+    def amplitude(self, answer: Any, scene: Scene) -> float:
         """Return the amplitude of the load over the largest of the training [-]."""
         return float(answer.amplitude)
 
@@ -173,60 +172,31 @@ class LoadRequest(NamedTuple):
         return iter(scene.solver.iterate(self.dimensionless(scene)))
 
 
-class GraspRequest(NamedTuple):
-    """A patch of the boundary that is moved as a rigid body.
+@dataclass(frozen=True, eq=False)
+class GraspRequest(LoadRequest):
+    """A patch of the boundary that is moved as a rigid body, under the other forces on the body.
 
     Attributes:
         nodes: Mask of the nodes of the patch, (N,).
         translation: Displacement of the mean of the patch over L, (D,) [-].
         rotation: Rotation vector about it, (3,), in 2D the angle, (1,) [rad].
-        others: The other forces on the body, and the moduli.
         sliding: True if the patch slides in the plane across its normal, see `Simulator.grasp`.
     """
 
+    varying: ClassVar[tuple[str, ...]] = ("force", "young", "translation", "rotation")
     nodes: Tensor
     translation: Tensor
     rotation: Tensor
-    others: LoadRequest
     sliding: bool = False
 
-    @property
-    def young(self) -> float:
-        """Young's modulus [Pa]."""
-        return self.others.young
-
-    @property
-    def parameters(self) -> Mapping[str, float]:
-        """Value of each range of the law, by name."""
-        return self.others.parameters
-
-    @property
-    def coordinates(self) -> Tensor:
-        """Translation and rotation, by which the page interpolates between grasps."""
-        return torch.cat([self.translation, self.rotation])
-
-    def continues(self, other: "ViewRequest") -> bool:
-        """Return True if the page interpolates from another request to this one."""
+    def continues(self, other: LoadRequest) -> bool:
+        """Return True if another request grasps the same patch in the same way."""
         if not isinstance(other, GraspRequest) or self.sliding != other.sliding:
             return False
         return torch.equal(self.nodes, other.nodes)
 
-    def at(self, coordinates: Tensor) -> "GraspRequest":
-        """Return the grasp with another motion."""
-        translation, rotation = coordinates.split([len(self.translation), len(self.rotation)])
-        return self._replace(translation=translation, rotation=rotation)
-
-    def with_moduli(self, young: float, parameters: Mapping[str, float]) -> "GraspRequest":
-        """Return the grasp of a body with another modulus [Pa] and other parameters of the law."""
-        return self._replace(others=self.others.with_moduli(young, parameters))
-
     def answer(
-        self,
-        simulator: Simulator,
-        tol: float | None,
-        budget_ms: float | None = None,
-        *,
-        warm: bool = True,
+        self, simulator: Simulator, tol: float | None, budget_ms: float | None = None
     ) -> GraspAnswer:
         """Return the answer of a simulator, which begins with the forces of the last grasp.
 
@@ -236,34 +206,35 @@ class GraspRequest(NamedTuple):
             self.nodes.numpy(),
             (self.translation * simulator.scene.length).tolist(),
             self.rotation,
-            force=self.others.force,
+            force=self.force,
             young=self.young,
             parameters=self.parameters,
             tol=tol,
             budget_ms=GRASP_LIMIT_MS if budget_ms is None else budget_ms,
-            warm=warm,
+            warm=True,
             sliding=self.sliding,
         )
 
-    def load(self, answer: Answer | GraspAnswer) -> LoadRequest:
-        """Return the load on the body: the forces of the gripper and the other forces."""
-        assert isinstance(answer, GraspAnswer)
-        gripper = torch.from_numpy(answer.nodal_force)
-        return self.others._replace(force=self.others.force + gripper)
+    def hand_force(self, answer: Any) -> Tensor:
+        """Return the forces of the gripper, (N, D) [N]."""
+        return torch.from_numpy(answer.nodal_force)
 
-    def amplitude(self, answer: Answer | GraspAnswer, scene: Scene) -> float:
+    def load(self, answer: Any) -> LoadRequest:
+        """Return the load on the body: the forces of the gripper and the other forces."""
+        force = self.force + self.hand_force(answer)
+        return LoadRequest(force, self.young, self.parameters)
+
+    def amplitude(self, answer: Any, scene: Scene) -> float:
         """Return the amplitude of equal forces on the patch with the sum of the gripper's [-].
 
         That of the forces themselves is large, because they are concentrated at the edge.
         """
-        assert isinstance(answer, GraspAnswer)
         unit = self.young * scene.force_unit * scene.loads.largest_force
-        total = float(torch.from_numpy(answer.force).norm())
-        return total / (unit * float(self.nodes.sum()) ** 0.5)
+        return float(np.linalg.norm(answer.force)) / (unit * float(self.nodes.sum()) ** 0.5)
 
     def newton_states(self, scene: Scene) -> Iterator[Solution]:
         """Yield the iterates of Newton's method from rest, with the patch as a moved support."""
-        load = self.others.dimensionless(scene)
+        load = self.dimensionless(scene)
         linear = scene.linear.with_parameters(load.parameters)
         directions = [True] * len(self.translation)
         patch = RigidPatch.of(linear, self.nodes.numpy(), directions, sliding=self.sliding)
@@ -272,24 +243,4 @@ class GraspRequest(NamedTuple):
         return newton.iterate(Load(load.force, load.young))  # the body has its parameters
 
 
-ViewRequest = LoadRequest | GraspRequest
-MakeRequest = Callable[[], ViewRequest]  # called in the thread of the worker
-
-
-def interpolate(start: ViewRequest, end: ViewRequest, share: float) -> ViewRequest:
-    """Return the request at a share of the way from `start` (0) to `end` (1)."""
-    if share >= 1:
-        return end
-    between = end.at(torch.lerp(start.coordinates, end.coordinates, share))
-    return between.with_moduli(start.young + share * (end.young - start.young), end.parameters)
-
-
-def scale_of(start: ViewRequest, goal: ViewRequest) -> float:
-    """Return the larger norm of the coordinates of two requests; 1 if both are zero."""
-    return max(float(start.coordinates.norm()), float(goal.coordinates.norm())) or 1.0
-
-
-def distance(request: ViewRequest, goal: ViewRequest, scale: float) -> float:
-    """Return the larger of the differences of coordinates over `scale` and of E over the goal's."""
-    apart = float((goal.coordinates - request.coordinates).norm()) / scale
-    return max(apart, abs(goal.young - request.young) / goal.young)
+MakeRequest = Callable[[], LoadRequest]  # called in the thread of the worker

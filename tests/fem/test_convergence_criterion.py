@@ -18,7 +18,6 @@ from dpl.data.solving.solve import LoadKey, failed_load, solve_load
 from dpl.fem.linear import conjugate_gradients
 from dpl.inference import Direct, Hybrid
 from dpl.inference.hybrid import RULES
-from dpl.viewer.frames import ViewSettings
 
 ONE = torch.ones(1, dtype=torch.float64)
 
@@ -119,7 +118,6 @@ TAKERS = {
     "changed newton": lambda newton, tol: replace(newton, tol=tol),
     "linear": lambda newton, tol: fem.LinearSolver(newton.problem, tol=tol),
     "direct": lambda newton, tol: Direct(lambda load: load.force, newton.problem, tol),
-    "view settings": lambda newton, tol: ViewSettings(tol=tol),
     "judge": lambda newton, tol: fem.evaluate_solution(
         newton.problem,
         torch.zeros(1, *newton.problem.shape, dtype=torch.float64),

@@ -29,16 +29,12 @@ PROGRAM = textwrap.dedent(
         print("at work", flush=True)
 
     if __name__ == "__main__":
-        {start}
+        from dpl.system.processes import spawn_context
+        worker = spawn_context().Process(target=task, daemon=True)
+        worker.start()
         {then}
     """
 )
-STARTS = {
-    "a worker of a pool": """
-        from dpl.system.processes import spawn_context
-        spawn_context().Process(target=task, daemon=True).start()
-    """,
-}
 MOMENTS = {
     "at once": "os.kill(os.getpid(), signal.SIGKILL)",
     "while it imports": "print('started', flush=True); threading.Event().wait()",
@@ -71,16 +67,10 @@ def launched(tmp_path, environment):
         process.communicate()
 
 
-def program(start, then):
-    indented = textwrap.indent(textwrap.dedent(start).strip(), 4 * " ").lstrip()
-    return PROGRAM.format(start=indented, then=then)
-
-
 @pytest.mark.timeout(3 * LONG)
-@pytest.mark.parametrize("start", STARTS.values(), ids=STARTS)
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_a_worker_that_is_still_importing_ends_with_its_parent(launched, start, moment):
-    parent = launched(program(start, MOMENTS[moment]))
+def test_a_worker_that_is_still_importing_ends_with_its_parent(launched, moment):
+    parent = launched(PROGRAM.format(then=MOMENTS[moment]))
     if moment == "while it imports":
         lines = {parent.stdout.readline() for _ in range(2)}
         assert lines == {"started\n", "importing\n"}
@@ -92,12 +82,9 @@ def test_a_worker_that_is_still_importing_ends_with_its_parent(launched, start, 
 
 @pytest.mark.timeout(3 * LONG)
 def test_a_worker_returns_its_exit_status_to_its_parent(launched):
-    text = program(
-        STARTS["a worker of a pool"]
-        .replace("spawn_context().Process", "worker = spawn_context().Process")
-        .replace(").start()", ")\n        worker.start()"),
-        "worker.join(); print(worker.exitcode, worker.pid != os.getpid())",
-    ).replace('    print("importing", flush=True)\n    threading.Event().wait()', "    pass")
+    text = PROGRAM.format(then="worker.join(); print(worker.exitcode, worker.pid != os.getpid())")
+    waits = '    print("importing", flush=True)\n    threading.Event().wait()'
+    text = text.replace(waits, "    pass")
     out, _ = launched(text).communicate(timeout=LONG)
     assert out == "at work\n0 True\n"
 

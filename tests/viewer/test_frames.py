@@ -1,13 +1,17 @@
 """Surfaces, patch loads and frames of the viewer."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from dpl.fem import NeoHookeanLn, fields, rectangle
+from dpl.fem import fields, rectangle
 from dpl.viewer import Body
+from dpl.viewer.controls import round_step
 from dpl.viewer.frames import ERROR, STRESS, ViewSettings
-from dpl.viewer.renderer import ColourScale, round_up
+from dpl.viewer.renderer import colour_top, engineering, round_up
 from dpl.viewer.surface import Surface, contour_bands
 
 
@@ -85,22 +89,6 @@ def test_stress_at_the_surface_is_that_of_the_whole_body(body, make_scene):
         assert surface.von_mises(u, load.parameters) == pytest.approx(exact, rel=1e-12)
 
 
-def test_recovered_stress_on_linear_tetrahedra_has_no_checkerboard(make_scene):
-    """Pure bending: the stress of each fibre is constant along the beam."""
-    scene = make_scene(cell="tetra", nodes=(17, 5, 5))
-    problem, surface = scene.problem, Surface.of(scene.problem)
-    x, y, z = (problem.points - problem.points.new_tensor([0.0, 0.125, 0.125])).T
-    nu, bend = 0.3, 1e-6
-    u = bend * torch.stack([x * z, -nu * y * z, -(x**2) / 2 - nu * (z**2 - y**2) / 2], dim=1)
-    stress = surface.von_mises(u, torch.zeros(1, 0).double()) / bend
-    points = surface.undeformed
-    inner = (points[:, 0] > 0.1) & (points[:, 0] < 0.9)
-    fibres, index = np.unique(points[inner, 1:].round(6), axis=0, return_inverse=True)
-    for fibre in range(len(fibres)):
-        values = stress[inner][index.ravel() == fibre]
-        assert np.ptp(values) < 0.02 * stress.max()
-
-
 def test_the_dragged_point_moves_to_the_target(body, patch_load):
     node, request = patch_load
     frame = body.solve(request, ViewSettings(tol=1e-8))
@@ -145,12 +133,11 @@ def test_values_are_those_of_the_quantity(body, patch_load):
 def test_displacements_and_stresses_scale_with_young(body, patch_load):
     _, request = patch_load
     settings = ViewSettings(quantity=STRESS, tol=1e-8)
-    stiff = body.solve(request._replace(young=2 * request.young), settings)
+    stiff = body.solve(replace(request, young=2 * request.young), settings)
     soft = body.solve(request, settings)
     assert stiff.displacement.norm() < 0.7 * soft.displacement.norm()
-    bigger = body.solve(
-        request._replace(force=3 * request.force, young=3 * request.young), settings
-    )
+    bigger = replace(request, force=3 * request.force, young=3 * request.young)
+    bigger = body.solve(bigger, settings)
     assert bigger.values == pytest.approx(3 * soft.values, rel=1e-5)
 
 
@@ -160,17 +147,11 @@ def test_newton_frames_start_undeformed_and_converge(body, patch_load):
     frame = body.solve(request, settings)
     iterates = list(body.newton_frames(request, settings, frame))
     assert iterates[0].points == pytest.approx(body.surface.undeformed)
-    assert [state.iteration for state in iterates] == sorted(state.iteration for state in iterates)
-    assert iterates[-1].converged
-    assert iterates[-1].residual < 1e-8
+    counts = [int(state.answer.iterations) for state in iterates]
+    assert counts == sorted(counts)
+    assert iterates[-1].answer.converged
+    assert iterates[-1].answer.residual < 1e-8
     assert iterates[-1].values.max() == pytest.approx(frame.values.max(), rel=1e-4)
-
-
-def test_random_loads_are_the_trainings(body):
-    for index in range(4):
-        answer = body.solve(body.sample(index), ViewSettings()).answer
-        assert not answer.out_of_distribution
-    assert not torch.equal(body.sample(0).force, body.sample(1).force)
 
 
 def test_ranges_of_moduli_are_those_of_the_scene(make_scene, make_body):
@@ -190,32 +171,41 @@ def test_poissons_ratio_changes_the_solution(make_scene, make_body):
     force = body.patch(node, 0.4).force_towards(torch.tensor([0.0, 0.0, 0.1]).double())
 
     def with_ratio(nu):
-        return body.with_moduli(body.request(force), body.young, {"poisson": nu})
+        return replace(body.request(force), parameters={"poisson": nu})
 
     settings = ViewSettings(quantity=STRESS, tol=1e-8)
     values = [body.solve(with_ratio(nu), settings).values.max() for nu in (0.2, 0.4)]
     assert values[0] != pytest.approx(values[1], rel=1e-3)
-    with pytest.raises(ValueError, match=r"poisson = 0.45 must lie between"):
-        with_ratio(0.45)
     request = with_ratio(0.25)
     *_, last = body.newton_frames(request, ViewSettings(), body.solve(request, ViewSettings()))
-    assert last.converged
-
-
-def test_a_body_in_2d_is_solved_and_shown(make_scene, make_body):
-    mesh = rectangle([100.0, 25.0], [9, 4])
-    body = make_body(make_scene(mesh=mesh, law=NeoHookeanLn))
-    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
-    force = body.patch(node, 0.4).force_towards(torch.tensor([0.0, 0.1]).double())
-    frame = body.solve(body.request(force), ViewSettings(quantity=STRESS, tol=1e-6))
-    assert frame.points.shape == (36, 3)
-    assert not frame.points[:, 2].any()
-    assert frame.values.shape == (36,)
+    assert last.answer.converged
 
 
 def test_the_colour_scale_has_rounded_ends_and_ignores_small_changes():
     assert [round_up(x) for x in (0.0, 1.0, 1.2, 7.0, 9.0, 480.0)] == [0, 1, 1.5, 8, 10, 500]
-    scale = ColourScale()
-    tops = [scale.update(np.array([0.0, top])) for top in (4.1, 4.9, 5.2, 4.1, 1.0)]
+    top, tops = 0.0, []
+    for largest in (4.1, 4.9, 5.2, 4.1, 1.0):
+        top = colour_top(np.array([0.0, largest]), top)
+        tops.append(top)
     assert tops == [5, 5, 6, 6, 1]
-    assert scale.update(np.array([np.nan, np.inf])) == 0
+    assert colour_top(np.array([np.nan, np.inf]), top) == 0
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        *((0.0, "N", "0 N"), (9583.0, "N", "9.58 kN"), (0.0034, "m", "3.4 mm")),
+        *((24.2, "m", "24.2 m"), (999.6, "Pa", "1 kPa"), (123_456.0, "Pa", "123 kPa")),
+        *((2.03e11, "Pa", "203 GPa"), (-1250.0, "N/m", "-1.25 kN/m"), (5e-6, "m", "5 µm")),
+        (math.nan, "N", "nan N"),
+    ],
+)
+def test_values_have_three_digits_and_a_prefix(value, unit, text):
+    assert engineering(value, unit) == text
+
+
+@pytest.mark.parametrize("span", [(1125.0, 18000.0), (0.25, 4.0), (1.0, 203.0), (1.0, 1.001)])
+def test_values_of_a_slider_have_at_most_five_digits(span):
+    step = round_step(*span)
+    assert step == pytest.approx(10.0 ** round(math.log10(step)))
+    assert len(f"{round(span[1] / step):d}") <= 5

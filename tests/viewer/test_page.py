@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import html
+import re
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -16,11 +17,10 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 from dpl.fem import SubspaceNewton, rectangle
 from dpl.inference import Simulator
 from dpl.viewer import AccessPolicy, Body, Page
-from dpl.viewer.controls import GRASP, PULL
+from dpl.viewer.controls import BAD, GRASP, PULL, WARNING
 from dpl.viewer.frames import QUANTITIES
 from dpl.viewer.recording import rotating_load
-from dpl.viewer.renderer import NEUTRAL
-from dpl.viewer.units import engineering
+from dpl.viewer.renderer import NEUTRAL, engineering
 
 BODIES = {
     "hexahedra": {},
@@ -37,7 +37,7 @@ def pages(request, make_scene, make_body, tmp_path_factory):
     """A page of a body, and a function that restores it."""
     body, folder = make_body(make_scene(**BODIES[request.param])), tmp_path_factory.mktemp("page")
     page = Page(body, AccessPolicy.bind("127.0.0.1", 0), title="t", folder=folder)
-    controls, node, radii = page.controls, page.node, dict(page.controls._radii)
+    controls, node = page.controls, page.node
     switches = (controls.mode, *controls.of_load, *controls.of_moduli)
     values = [(control, control.value) for control in (*switches, *controls.of_settings)]
     assert page.worker.wait(240)
@@ -45,7 +45,7 @@ def pages(request, make_scene, make_body, tmp_path_factory):
     def restore():
         for control, value in values:
             control.value = value
-        page.node, controls._radii, controls._shown_mode = node, dict(radii), PULL
+        page.node = node
         page.apply_mode()
         page.apply_settings(None)
         page.reset(None)
@@ -62,6 +62,14 @@ def page(pages):
     page, restore = pages
     restore()
     return page
+
+
+def problem(page):
+    """Return the message about a state that cannot be used, empty if there is none."""
+    page.refresh()
+    line = rf'color:(?:{BAD}|{WARNING});line-height:1.35">(.*?)</div>'
+    found = re.search(line, page.controls.readings.content)
+    return html.unescape(found[1]) if found else ""
 
 
 def drag_tip(page, motion):
@@ -83,13 +91,13 @@ def test_a_dragged_point_follows_the_mouse(page):
     tip = frame.displacement[page.node] / page.body.scene.length
     assert tip[-1] == pytest.approx(0.08, rel=0.3)
     page.refresh()
-    result, unit = page.controls._result.content, "N/m" if flat else "N"
+    result, unit = page.controls.readings.content, "N/m" if flat else "N"
     assert result.index("estimated error") < result.index("total force")
-    assert "min det F" in page.controls._details.content
+    assert "min det F" in page.controls.details.content
     assert engineering(float(frame.request.force.sum(dim=0).norm()), unit) in result
     assert engineering(float(frame.displacement[page.node].norm()), "m") in result
-    assert "displacement [m]" in page.controls._legend.content
-    assert page._error == ""
+    assert "<b>displacement</b>" in result
+    assert problem(page) == ""
 
 
 def select(page, mode):
@@ -112,14 +120,14 @@ def test_a_grasped_patch_follows_the_mouse(page):
     assert page._marker.mask.any()
     assert page._marker._arrow.visible
     page.refresh()
-    result, grasp = page.controls._result.content, frame.grasp
+    result, grasp = page.controls.readings.content, frame.grasp
     units = ("N", "N m") if dim == 3 else ("N/m", "N")
     for vector, unit in zip((grasp.force, grasp.moment), units, strict=True):
         assert engineering(float(np.linalg.norm(vector)), unit) in result
-    details = page.controls._details.content
+    details = page.controls.details.content
     assert engineering(grasp.motion_error, "m") in details
     assert html.escape(grasp.summary) in details
-    assert page.controls._error.content == ""
+    assert problem(page) == ""
     drag_tip(page, motion)
     moved = page.frame.displacement[held] / page.body.scene.length
     expected = torch.from_numpy(2 * motion[:dim]).expand_as(moved)
@@ -151,15 +159,19 @@ def test_each_mode_has_its_controls_and_its_radius(page):
     controls = page.controls
     planar = page.body.scene.problem.shape[1] == 2
     of_pull = (controls.direction, controls.amplitude)
-    controls.radius.value = 0.31
+    controls.radii[PULL].value = 0.31
     for mode in (GRASP, PULL):
         select(page, mode)
         assert {control.visible for control in of_pull} == {mode == PULL}
         assert controls.angle.visible == controls.sliding.visible == (mode == GRASP)
         assert controls.axis.visible == (mode == GRASP and not planar)
-    assert controls.radius.value == 0.31
+        assert [radius.visible for radius in controls.radii.values()] == [
+            mode == PULL,
+            mode == GRASP,
+        ]
+    assert controls.radius == 0.31
     select(page, GRASP)
-    assert controls.radius.value == 0.15
+    assert controls.radius == 0.15
     mask = page.hand.marked_nodes(page.node)[page.body.surface.nodes]
     assert len(page._marker._dots.points) == mask.sum()
 
@@ -184,17 +196,15 @@ def test_a_patch_that_cannot_move_is_reported_in_one_line(page):
     drag_tip(page, np.array([0.0, 0.0, 0.05]))
     frame = page.frame
     select(page, GRASP)
-    page.controls.radius.value = 0.01
+    page.controls.radii[GRASP].value = 0.01
     event = SimpleNamespace(ray_origin=(-3.0, 0.125, 0.125), ray_direction=(1.0, 0.0, 0.0))
     asyncio.run(page.click(event))
     assert page.worker.wait(240)
-    page.refresh()
-    assert "the patch has no free node of the boundary" in page.controls._error.content
+    assert problem(page) == "region: no node of the boundary in it is free to move"
     assert page.frame is frame
     drag_tip(page, np.array([0.0, 0.0, 0.02]))
-    page.refresh()
     assert page.frame.grasp is not None
-    assert page.controls._error.content == ""
+    assert problem(page) == ""
 
 
 def test_a_state_that_cannot_be_used_is_reported_in_one_line(page):
@@ -202,17 +212,16 @@ def test_a_state_that_cannot_be_used_is_reported_in_one_line(page):
     drag_tip(page, np.array([0.0, 0.0, 0.04]))
     good = page.frame
     far = replace(good.grasp, motion_error=0.5, error=0.37)
-    for frame, words in (
-        (good._replace(volume_ratio=-0.1), "Not valid: an element is inverted"),
-        (good._replace(volume_ratio=float("nan")), "Not valid: an element is inverted"),
-        (good._replace(answer=far), "estimated error 37 %, the patch is 500 mm away from the hand"),
-        (good, ""),
+    inverted = [replace(good.grasp, volume_ratio=ratio) for ratio in (-0.1, float("nan"))]
+    for answer, words in (
+        *((answer, "Not valid: an element is inverted") for answer in inverted),
+        (far, "estimated error 37 %, the patch is 500 mm away from the hand"),
+        (good.grasp, ""),
     ):
-        page._show(frame)
-        page.refresh()
-        content = page.controls._error.content
-        assert words in content
-        assert bool(words) == bool(content)
+        page._show(good._replace(answer=answer))
+        found = problem(page)
+        assert words in found
+        assert bool(words) == bool(found)
 
 
 def test_a_grasp_that_takes_too_long_is_stopped_and_reported(page, monkeypatch):
@@ -220,23 +229,21 @@ def test_a_grasp_that_takes_too_long_is_stopped_and_reported(page, monkeypatch):
     assert page.worker.wait(240)
     select(page, GRASP)
     drag_tip(page, np.array([0.0, 0.0, 0.04]))
-    page.refresh()
     assert page.frame.grasp.stopped
-    assert "Not solved: stopped after 0." in page.controls._error.content
+    assert problem(page).startswith("Not solved: stopped after 0.")
     page.controls.method.value = "best within the budget"
     page.controls.budget.value = 1e4
     page.apply_settings(None)
     assert page.worker.wait(240)
-    page.refresh()
-    assert page.frame.converged
-    assert page.controls._error.content == ""
+    assert page.frame.answer.converged
+    assert problem(page) == ""
 
 
 @of_bodies(["hexahedra", "2D"])
 def test_a_sliding_patch_moves_along_its_normal(page):
     select(page, GRASP)
     page.controls.sliding.value = True
-    page.controls.radius.value = 0.3
+    page.controls.radii[GRASP].value = 0.3
     drag_tip(page, np.array([0.02, 0.01, 0.0]))
     request, grasp = page.frame.request, page.frame.grasp
     assert request.sliding
@@ -253,10 +260,8 @@ def test_a_sliding_patch_moves_along_its_normal(page):
 def test_a_long_solve_is_reported_until_its_frame_is_shown(page, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(type(page.worker), "solving_time", 3.2)
-        page.refresh()
-        assert "Solving for 3 s ..." in page.controls._error.content
-    page.refresh()
-    assert page.controls._error.content == ""
+        assert problem(page) == "Solving for 3 s ..."
+    assert problem(page) == ""
 
 
 @of_bodies(["degree 2", "2D", "range of Poisson's ratios"])
@@ -303,16 +308,16 @@ def test_a_body_at_rest_is_neutral_and_has_no_legend(page):
         page.apply_settings(None)
         assert page.worker.wait(240)
         page.refresh()
-        assert page.controls._legend.content == ""
-        visible = [band for band in node._bands if band.visible and len(band.vertices) > 3]
+        assert "on the surface" not in page.controls.readings.content
+        visible = [band for band in node._meshes[:-1] if band.visible]
         assert [tuple(band.color) for band in visible] == [NEUTRAL]
     drag_tip(page, np.array([0.0, 0.0, 0.08]))
     page.refresh()
-    assert "on the surface" in page.controls._legend.content
+    assert "on the surface" in page.controls.readings.content
     page.reset(None)
     assert page.worker.wait(240)
     page.refresh()
-    assert page.controls._legend.content == ""
+    assert "on the surface" not in page.controls.readings.content
 
 
 @of_bodies(["range of Young's moduli"])
@@ -330,21 +335,22 @@ def test_the_slider_of_youngs_modulus_has_a_unit_with_prefix(page):
 @of_bodies(["degree 2", "2D"])
 def test_feature_edges_replace_element_edges(page):
     node, surface = page._body_node, page.body.surface
-    assert node._edges.visible
-    assert not node._mesh.visible
-    assert len(node._edges.points) == len(surface.feature_edges) < len(surface.edges)
-    assert node._slab.visible
+    edges, mesh, undeformed = node._lines
+    assert [lines.visible for lines in node._lines] == [True, False, False]
+    assert len(edges.points) == len(surface.feature_edges) < len(surface.edges)
+    assert node._meshes[-1].visible, "symbols of the supports"
     page.controls.edges.value = True
     drag_tip(page, np.array([0.0, 0.05, 0.0]))
-    assert node._mesh.visible
-    assert len(node._mesh.points) == len(surface.edges)
+    assert mesh.visible
+    assert undeformed.visible
+    assert len(mesh.points) == len(surface.edges)
 
 
 def test_errors_are_shown_at_once_and_escaped(page, monkeypatch):
     monkeypatch.setattr(page.worker, "submit", lambda make: page._show_error("<script>"))
     page.reset(None)
-    page.refresh()
-    assert "&lt;script&gt;" in page.controls._error.content
+    assert problem(page) == "<script>"
+    assert "<script>" not in page.controls.readings.content
 
 
 def test_the_camera_of_a_browser_is_fitted_to_its_window(page):
@@ -359,8 +365,9 @@ def test_the_camera_of_a_browser_is_fitted_to_its_window(page):
 
 def test_dots_lie_above_the_surface(page):
     marker, points = page._marker, page.frame.points
+    marker.show(page.frame)
     middle = points.mean(axis=0)
-    above = np.linalg.norm(marker._dot_positions(points) - middle, axis=1)
+    above = np.linalg.norm(marker._dots.points - middle, axis=1)
     assert len(above) == marker.mask.sum()
     assert (above > np.linalg.norm(points[marker.mask] - middle, axis=1)).all()
 
@@ -389,7 +396,7 @@ def test_no_part_of_the_path_of_a_recording_comes_from_the_browser(page):
     event = SimpleNamespace(client=None, target=SimpleNamespace(value="x/../../stolen.GIF"))
     with pytest.raises(KeyError):
         page._save(event)
-    assert list(page.folder.parent.rglob("*.gif")) == []
+    assert list(page.folder.parent.rglob("*stolen*")) == list(page.folder.rglob("*")) == []
 
 
 def test_a_frame_that_is_not_finite_is_shown_as_invalid(page, monkeypatch):
@@ -398,8 +405,8 @@ def test_a_frame_that_is_not_finite_is_shown_as_invalid(page, monkeypatch):
     page.sample(None)
     assert page.worker.wait(240)
     page.refresh()
-    assert "above 100 %" in page.controls._result.content
-    assert "NOT VALID" in page.controls._details.content
+    assert "above 100 %" in page.controls.readings.content
+    assert "NOT VALID" in page.controls.details.content
 
 
 @of_bodies(["hexahedra", "2D"])

@@ -32,7 +32,7 @@ def recording(body):
         recording.add(
             body.solve(body.sample(index), ViewSettings(quantity="von Mises stress")), now
         )
-    recording.stop()
+    recording.running = False
     return recording
 
 
@@ -42,7 +42,7 @@ def test_a_series_contains_forces_displacements_stresses_and_volume_ratios(
     path = recording.save_series(tmp_path)
     sets = ET.parse(path).getroot().findall(".//DataSet")
     assert [float(one.get("timestep")) for one in sets] == pytest.approx([0.0, 0.2, 0.5])
-    for one, (_, frame) in zip(sets, recording.frames(), strict=True):
+    for one, (_, frame) in zip(sets, recording.frames, strict=True):
         found = meshio.read(path.parent / one.get("file"))
         assert np.ptp(found.points[:, 0]) == pytest.approx(100.0)
         data = found.point_data
@@ -68,7 +68,7 @@ def test_a_series_of_a_grasp_contains_the_forces_of_the_gripper(body, tmp_path):
     assert data["force [N]"] == pytest.approx(frame.grasp.nodal_force)
     assert np.linalg.norm(data["force [N]"].sum(axis=0)) > 1.0
     assert data["displacement [m]"] == pytest.approx(frame.grasp.displacement)
-    renderer = Renderer.fitting(body.surface, [frame], (640, 360))
+    renderer = Renderer.fitting(body, [frame], (640, 360))
     assert is_red(np.asarray(renderer.render(frame, 1.0, []))).sum() > 40, "an arrow of the force"
 
 
@@ -94,19 +94,19 @@ def test_an_animation_has_the_duration_of_the_recording(recording, body, tmp_pat
 
 
 def test_frames_are_added_while_recording_up_to_the_limit(recording, body, tmp_path):
-    frames = recording.frames()
+    frames = recording.frames
     chosen = resample(frames)
     assert chosen[0] is frames[0][1], "the last frame that was shown before each tick"
     assert chosen[round(0.3 * FRAME_RATE)] is frames[1][1]
     assert chosen[-1] is frames[-1][1]
     recording.add(chosen[0], 11.0)
-    assert len(recording) == 3
+    assert len(recording.frames) == 3
     recording.start()
     with pytest.raises(ValueError, match="the recording is empty"):
         recording.save_series(tmp_path)
     for k in range(MAX_FRAMES + 5):
         recording.add(chosen[0], float(k))
-    assert len(recording) == MAX_FRAMES
+    assert len(recording.frames) == MAX_FRAMES
     assert not recording.running
 
 
@@ -117,7 +117,7 @@ def is_red(picture):
 
 def test_an_image_shows_the_deformed_body_and_the_arrow_of_its_load(body):
     frame = body.solve(body.sample(1), ViewSettings())
-    renderer = Renderer.fitting(body.surface, [frame], (640, 360))
+    renderer = Renderer.fitting(body, [frame], (640, 360))
     picture = np.asarray(renderer.render(frame, 1.0, []))
     background = picture[0, 0].astype(int)
     pixels = renderer.camera.project(frame.points, 640, 360)[:, :2]
@@ -127,14 +127,14 @@ def test_an_image_shows_the_deformed_body_and_the_arrow_of_its_load(body):
     rest = renderer.render(frame._replace(points=body.surface.undeformed), 1.0, [])
     assert np.abs(np.asarray(rest).astype(int) - picture).max() > 50
     assert is_red(picture).sum() > 40, "an arrow of the load"
-    zero = frame.load._replace(force=0 * frame.load.force)
-    unloaded = np.asarray(renderer.render(frame._replace(load=zero), 1.0, []))
+    zero = replace(frame.request, force=0 * frame.request.force)
+    unloaded = np.asarray(renderer.render(frame._replace(request=zero), 1.0, []))
     assert not is_red(unloaded).any()
 
 
 def test_an_image_of_a_body_at_rest_is_grey_and_has_no_legend(body):
     frame = body.solve(body.zero_load(), ViewSettings())
-    renderer = Renderer.fitting(body.surface, [frame], (640, 360))
+    renderer = Renderer.fitting(body, [frame], (640, 360))
     picture = np.asarray(renderer.render(frame, 0.0, [])).astype(int)
     assert np.ptp(picture, axis=2).max() < 50, "neutral colours"
     with_legend = np.asarray(renderer.render(frame, 1.0, []))[:, 560:]

@@ -3,6 +3,7 @@
 import itertools
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -40,19 +41,6 @@ def make_worker(body, shown, monkeypatch):
         assert not worker.is_alive()
 
 
-def test_loads_are_smoothed_on_the_way_to_the_most_recent_one(make_worker, body, shown):
-    worker, load = make_worker(smoothing_time=0.05), body.sample(1)
-    for goal in (load, body.zero_load()):
-        before = len(shown)
-        worker.submit(lambda goal=goal: goal)
-        assert worker.wait(LONG)
-        assert shown[-1].request is goal
-        assert 3 < len(shown) - before < 60
-        sizes = [float(frame.request.force.norm()) for frame in shown[before:]]
-        assert sizes == sorted(sizes, reverse=goal is not load)
-    assert shown[-1].answer.method == "rest"
-
-
 @pytest.fixture
 def patch(body):
     """The patch at the tip."""
@@ -65,18 +53,24 @@ def lifted(body, patch, height):
     return body.grasp(patch.held_nodes, torch.tensor([0.0, 0.0, height]).double(), rotation)
 
 
-def test_the_motion_of_a_grasped_patch_is_smoothed(make_worker, body, shown, patch):
+@pytest.mark.parametrize("kind", ["load", "grasp"])
+def test_requests_are_smoothed_on_the_way_to_the_most_recent_one(
+    make_worker, body, shown, patch, kind
+):
     worker = make_worker(smoothing_time=0.05)
-    for height in (0.01, 0.06):
-        before, goal = len(shown), lifted(body, patch, height)
+    goals = [body.sample(1), body.zero_load()]
+    if kind == "grasp":
+        goals = [lifted(body, patch, height) for height in (0.01, 0.06)]
+    for goal in goals:
+        before = len(shown)
         worker.submit(lambda goal=goal: goal)
         assert worker.wait(LONG)
-    assert shown[-1].request is goal
-    heights = [float(frame.request.translation[2]) for frame in shown[before:]]
-    assert len(heights) > 3
-    assert heights == sorted(heights)
-    assert all(0.01 < height <= 0.06 for height in heights)
-    assert all(torch.equal(frame.request.nodes, patch.held_nodes) for frame in shown[before:])
+        assert shown[-1].request is goal
+    assert 3 < len(shown) - before < 60
+    sizes = [float(getattr(frame.request, "translation", frame.request.force).norm())
+             for frame in shown[before:]]  # fmt: skip
+    assert sizes == sorted(sizes, reverse=kind == "load")
+    assert len(set(sizes)) > 3
 
 
 def test_there_is_one_frame_where_nothing_can_be_interpolated(make_worker, body, shown, patch):
@@ -91,21 +85,11 @@ def test_there_is_one_frame_where_nothing_can_be_interpolated(make_worker, body,
         worker.submit(make, settings)
         assert worker.wait(LONG)
         assert len(shown) == before + 1
-    assert shown[-1].converged
+    assert shown[-1].answer.converged
     before, worker = len(shown) + 1, make_worker(smoothing_time=0.0)
     worker.submit(lambda: body.sample(1))
     assert worker.wait(LONG)
     assert len(shown) == before + 1
-
-
-def test_newton_is_compared_with_a_grasp(make_worker, body, shown, patch):
-    newton = []
-    worker = make_worker(smoothing_time=0.0, min_frame_time=0.0, on_newton=newton.append)
-    worker.submit(lambda: lifted(body, patch, 0.05), ViewSettings(tol=1e-8, show_newton=True))
-    assert worker.wait(LONG)
-    last = newton[-1]
-    assert last.converged
-    assert last.points == pytest.approx(shown[-1].points, abs=1e-6)
 
 
 def test_the_time_of_a_solve_is_known_while_it_lasts(make_worker, body):
@@ -154,7 +138,7 @@ def test_newton_iterates_are_shown_until_a_new_load_arrives(make_worker, body, s
     assert worker.wait(LONG)
     iterates = [frame for frame in newton if frame is not None]
     assert len(iterates) > 3
-    assert iterates[-1].converged
+    assert iterates[-1].answer.converged
     newton.clear()
     worker.min_frame_time = 1e6
     worker.submit(lambda: body.sample(2))
@@ -168,10 +152,9 @@ def test_newton_iterates_are_shown_until_a_new_load_arrives(make_worker, body, s
 def test_an_error_is_reported_and_the_next_load_is_solved(make_worker, body, shown):
     messages = []
     worker = make_worker(smoothing_time=0.0, on_error=messages.append)
-    worker.submit(lambda: body.with_moduli(body.zero_load(), 1.0))
+    worker.submit(lambda: replace(body.zero_load(), young=-1.0))
     assert worker.wait(LONG)
-    assert messages
-    assert messages[0].startswith("young = 1 must lie between")
+    assert messages == ["young: a modulus is not above 0 Pa"]
     load = body.sample(1)
     worker.submit(lambda: load)
     assert worker.wait(LONG)
