@@ -279,6 +279,6 @@ def _layer(blocks: Condensed, numbers: Integers) -> Layer:
         own, other = middle - first, last - middle
         pivots[k, :own], boundary[k, :other] = unknowns[first:middle], unknowns[middle:last]
         square, rest = np.split(values[:, place : place + own * (own + other)], [own * own], axis=1)
-        inverse[:, k, :own, :own] = square.reshape(-1, own, own)
-        coupling[:, k, :own, :other] = rest.reshape(-1, own, other)
+        inverse[:, k, :own, :own] = square.reshape(len(values), own, own)
+        coupling[:, k, :own, :other] = rest.reshape(len(values), own, other)
     return Layer(*map(torch.from_numpy, (pivots, boundary, inverse, coupling)))
