@@ -20,6 +20,7 @@ from dpl.fem.assembly.elements import (
     QUADRATICALLY,
     basis_of,
     gradients,
+    is_simplex,
     locking_warnings,
 )
 from dpl.fem.assembly.equilibrium import relative_norm, relative_rounding
@@ -165,7 +166,7 @@ class Problem:
                 ranges.
             degree: Degree of the displacement, 1 or 2.
             mean_dilatation: Project the volume ratio in each cell, so that nearly incompressible
-                bodies of quadrilaterals and hexahedra do not lock, see `CellVolumes`.
+                bodies do not lock, see `CellVolumes`. Triangles and tetrahedra need degree 2.
             length: L [m]; the longest side of the body if left out.
             young: Young's modulus [Pa] by which boundary values are divided: stiffnesses of
                 foundations, follower loads, and the tractions and body forces of `dpl.fem.loads`.
@@ -177,7 +178,7 @@ class Problem:
                 boundary value is invalid, or `mean_dilatation` has no effect on the cells.
 
         Warns:
-            UserWarning: Linear elements will lock, see `locking_warnings`.
+            UserWarning: The elements will lock, see `locking_warnings`.
         """
         if degree not in (1, 2):
             raise ValueError(f"degree = {degree} must be 1 or 2")
@@ -187,10 +188,10 @@ class Problem:
         mesh, origin = near_origin(mesh)
         mesh, origin = mesh.scaled(1.0 / length), origin / length
         basis = basis_of(mesh, degree)
-        if mean_dilatation and mesh.elem.refdom.name not in ("Quadrilateral", "Hexahedral"):
+        if mean_dilatation and degree == 1 and is_simplex(mesh):
             raise ValueError(
-                "mean_dilatation: applies to quadrilaterals and hexahedra only; "
-                f"{QUADRATICALLY}; quadratic elements hardly lock"
+                "mean_dilatation = true must be used with hexahedra, quadrilaterals or quadratic "
+                f"elements; {QUADRATICALLY}, or mesh the body with hexahedra"
             )
         units = Units(length, young)
         given, springs = assemble_constraints(
@@ -211,7 +212,7 @@ class Problem:
         if mean_dilatation:
             at = np.asarray(basis.global_coordinates())[:, : len(dV)].transpose(1, 2, 0)
             both = torch.from_numpy(np.ascontiguousarray(at)), torch.from_numpy(dV.copy())
-            functions = CellVolumes.of(*both, linear=degree == 2).functions
+            functions = CellVolumes.of(*both, linear=degree == 2 and not is_simplex(mesh)).functions
         boundary = np.zeros(basis.N, dtype=bool)
         boundary[basis.get_dofs(mesh.boundary_facets()).all()] = True
         return cls(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dpl.fem.assembly.elements import basis_of, reference_gradients
 from dpl.fem.assembly.kernels import CompiledLoops, Kernels
-from dpl.fem.assembly.mean_dilatation import CellVolumes
+from dpl.fem.assembly.mean_dilatation import POINT_SHEAR, CellVolumes
 from dpl.fem.assembly.recovery import Recovery
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
@@ -54,8 +54,10 @@ class Discretisation:
     @property
     def volumes(self) -> CellVolumes | None:
         """Polynomials of the volume change in the cells; None without mean dilatation."""
-        functions = self.volume_functions
-        return None if functions is None else CellVolumes(functions, self.dV)
+        if (functions := self.volume_functions) is None:
+            return None
+        is_reduced = self.degree == 2 and functions.shape[-1] == 1  # simplices
+        return CellVolumes(functions, self.dV, POINT_SHEAR if is_reduced else 0.0)
 
     @cached_property
     def basis(self) -> skfem.Basis:
@@ -96,8 +98,9 @@ class Discretisation:
         numbers = chosen.numpy()
         key = numbers.tobytes()
         if key not in self._kernels:
-            own = [0] if self.equal_cells else numbers
-            psi = None if self.volume_functions is None else self.volume_functions.numpy()[own]
+            own, volumes = [0] if self.equal_cells else numbers, self.volumes
+            if volumes is not None:
+                volumes = volumes._replace(functions=volumes.functions[own])
             self._kernels[key] = Kernels(
                 law,
                 cells=self.cells.numpy()[numbers],
@@ -105,7 +108,7 @@ class Discretisation:
                 dN=self.dN.numpy()[own],
                 dV=self.dV.numpy()[own],
                 places=self.pattern.places.reshape(len(self.cells), -1)[numbers],
-                functions=psi,
+                volumes=volumes,
             )
         return self._kernels[key].with_law(law)
 
