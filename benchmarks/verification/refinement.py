@@ -344,8 +344,10 @@ def _draw_locking(path: Path, found: dict[str, list[float]]) -> None:
             xscale="log",
         )
         away = 0.5 - np.array(POISSON)
-        for k, (name, values) in enumerate(found.items()):
-            measured(ax, away, values, k, name)
+        elements = [name.split()[0].strip(",") for name in found]
+        for element, (name, values) in zip(elements, found.items(), strict=True):
+            dashed = {"linestyle": "--"} if "mean" in name else {}
+            measured(ax, away, values, elements.index(element), name, **dashed)
             if known := [float(text) for text in LOCKING[name][3].split()]:
                 reference(ax, away, known)
         reference(ax, [], [], "independent code")

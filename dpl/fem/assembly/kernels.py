@@ -99,36 +99,26 @@ class Kernels:
         other._set_law(material)
         return other
 
-    def force(self, u: Array, out: Array, member: int = 0) -> float:
-        """Add the internal force of u to `out`; return min det F.
+    def add(
+        self, u: Array, force: Array, values: Array, *, gap: Gap = NO_GAP, member: int = 0
+    ) -> float:
+        """Add force (N, D) and, unless empty, tangent (nnz + SPARE,) at u (N, D).
 
-        Args:
-            u: Displacement, (N, D).
-            out: Internal force, (N, D).
-            member: Index of the moduli, where each member of a batch has its own.
+        Returns min det F, with a gap min det C of the mixed points. Members of a batch may have
+        their own moduli.
         """
-        return self._add(member, u, NO_GAP, out, NO_VALUES)
-
-    def system(self, u: Array, gap: Gap, out: Array, values: Array) -> float:
-        """Add force (N, D) and tangent (nnz + SPARE,) at u; return min det C of mixed points.
-
-        Raises:
-            ValueError: The members of a batch have different moduli.
-        """
-        if len(self._constants) > 1:
-            raise ValueError("parameters must be the same for all loads; linearise them one by one")
-        lowest = self._add(0, u, gap, out, values)
-        return math.inf if gap is NO_GAP else lowest
-
-    def _add(self, member: int, u: Array, gap: Gap, out: Array, values: Array) -> float:
         law, needs, finite = self._law
-        moduli = self._constants[member if len(self._constants) > 1 else 0]
-        volumes = None
+        moduli, volumes = self._constants[member if len(self._constants) > 1 else 0], None
         if self._bulk is not None:
             volumes = self.functions, self._bulk[member if len(self._bulk) > 1 else 0]
         law_arguments = law, moduli, self._frames, needs, finite
-        arguments = *law_arguments, u, gap, *self._body, volumes, self.places, out, values
+        arguments = *law_arguments, u, gap, *self._body, volumes, self.places, force, values
         return 1 + call_compiled(element_loops.add_system, *arguments)
+
+    @property
+    def n_members(self) -> int:
+        """Number of the members of a batch that have their own moduli, or 1."""
+        return len(self._constants)
 
     @property
     def _body(self) -> tuple[Any, ...]:
@@ -158,17 +148,28 @@ class CompiledLoops(NamedTuple):
         displacement = displacement.detach().contiguous()
         internal = torch.zeros(displacement.shape, dtype=torch.float64)
         pairs = enumerate(zip(displacement.numpy(), internal.numpy(), strict=True))
-        lowest = [min(group.force(u, out, k) for group in self.groups) for k, (u, out) in pairs]
+        lowest = [
+            min(group.add(u, out, NO_VALUES, member=k) for group in self.groups)
+            for k, (u, out) in pairs
+        ]
         return internal, torch.tensor(lowest, dtype=torch.float64)
 
     def linearise(
         self, displacement: Tensor, gap: Sequence[Gap] | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return force (1, N, D), tangent (1, nnz) and min det C of the mixed points (1,)."""
+        """Return force (1, N, D), tangent (1, nnz) and min det C of the mixed points (1,).
+
+        Raises:
+            ValueError: The members of a batch have different moduli.
+        """
+        if any(group.n_members > 1 for group in self.groups):
+            raise ValueError("parameters must be the same for all loads; linearise them one by one")
         u = displacement[0].detach().contiguous().numpy()
         force, values = np.zeros(u.shape), np.zeros(self.n_entries + SPARE)
-        lowest = min(group.system(u, own, force, values) for group, own in self._with_gaps(gap))
+        pairs = self._with_gaps(gap)
+        lowest = min(group.add(u, force, values, gap=own) for group, own in pairs)
         tangent = torch.from_numpy(values[: self.n_entries])[None]
+        lowest = math.inf if gap is None else lowest
         return torch.from_numpy(force)[None], tangent, torch.tensor([lowest])
 
     def update_strain_gap(
