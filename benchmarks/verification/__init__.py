@@ -69,6 +69,9 @@ SHOWN: dict[str, tuple[str, ...]] = {  # values on the page, besides all that ex
     "locking": (
         "hex8, 16 × 4 × 4, ν = 0.4999",
         "hex8 with mean dilatation, 16 × 4 × 4, ν = 0.4999",
+        "tet10 with mean dilatation, 8 × 2 × 2, ν = 0.4999",
+        "Cook's membrane, tri6 with mean dilatation, 8 × 8, ν = 0.4999: u_y(48, 60) [mm], "
+        "quad9, 32 × 32",
     ),
     "beam": (
         "hex8, 39 × 9 × 9, SVK, q = 40 Pa: u_z [m]",

@@ -145,13 +145,26 @@ OTHERS: list[tuple[str, fem.Material, int, str]] = [  # 8 x 8 cells, independent
 
 def membrane(law: fem.Material, n: int, degree: int) -> tuple[fem.Problem, Tensor]:
     """Return Cook's membrane of n^2 cells in plane strain with its displacement [mm]."""
-    mesh = fem.rectangle([1.0, 1.0], [n + 1, n + 1])
+    problem, force = loaded_membrane(law, n, degree)
+    return problem, balanced(fem.Newton(problem), force).displacement[0] * problem.length
+
+
+def loaded_membrane(
+    law: fem.Material, n: int, degree: int, *, cell: str = "quad", young: float = 0.4225 * 2.6,
+    mean_dilatation: bool = False,
+) -> tuple[fem.Problem, Tensor]:  # fmt: skip
+    """Return Cook's membrane and the forces of a shear traction of 1/16 N/mm2 on the right.
+
+    It has n cells a side, triangles in pairs. `young` is Young's modulus [N/mm2], by default of
+    mu = 0.4225 N/mm2 and nu = 0.3.
+    """
+    mesh = fem.rectangle([1.0, 1.0], [n + 1, n + 1], cell)
     x, y = mesh.p
     mesh = type(mesh)(np.stack([48 * x, 44 * x + y * (44 - 28 * x)]), mesh.t)
-    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=degree)
-    young = 0.4225 * 2.6  # [N/mm2], of mu = 0.4225 and nu = 0.3
-    force = fem.Traction(fem.Plane(0, "max"), [0.0, 1 / 16 / young]).on(problem)
-    return problem, balanced(fem.Newton(problem), force).displacement[0] * problem.length
+    problem = fem.Problem.build(
+        mesh, law, fixed=fem.Plane(0, "min"), degree=degree, mean_dilatation=mean_dilatation
+    )
+    return problem, fem.Traction(fem.Plane(0, "max"), [0.0, 1 / 16 / young]).on(problem)
 
 
 def at(problem: fem.Problem, field: Tensor, place: Sequence[float]) -> tuple[float, ...]:
@@ -221,10 +234,13 @@ LOCKING = {  # compliance over that of hex27, 16 x 4 x 4: cells, cell, degree, v
     "tet10, 8 × 2 × 2": ((8, 2, 2), "tetra", 2, ".991 .973 .957 .947 .945"),
     "hex27, 8 × 2 × 2": ((8, 2, 2), "hexahedron", 2, ".996 .981 .963 .954 .952"),
     "hex8 with mean dilatation, 16 × 4 × 4": ((16, 4, 4), "hexahedron", 1, ""),
+    "tet10 with mean dilatation, 8 × 2 × 2": ((8, 2, 2), "tetra", 2, ""),
     "hex27 with mean dilatation, 8 × 2 × 2": ((8, 2, 2), "hexahedron", 2, ""),
 }
 RATIOS = (10.0, 1e2, 1e3, 1e4, 1e5)  # bulk over shear modulus
 MOST_ITERATIONS = 10  # of Newton's method where they do not grow with the bulk modulus
+BENT = {"hex8": ("hexahedron", 1), "hex27": ("hexahedron", 2), "tet10": ("tetra", 2)}
+SHEARED = 38.49 / 16  # Young's modulus of a nearly incompressible membrane [N/mm2]
 
 
 def compliance(
@@ -240,17 +256,26 @@ def compliance(
     return float((force * fem.LinearSolver(problem).solve(force)).sum())
 
 
-def bending(ratio: float, degree: int, *, mean: bool = True) -> tuple[float, int]:
+def sheared(nu: float, n: int, cell: str, *, mean: bool = True) -> tuple[float, int]:
+    """Return u_y at (48, 60) [mm] of Cook's membrane of NHiso-k2, and the Newton iterations."""
+    law = fem.NeoHookeanIsoK2(nu)
+    problem, force = loaded_membrane(law, n, 2, cell=cell, young=SHEARED, mean_dilatation=mean)
+    solution = balanced(fem.Newton(problem), force)
+    u = solution.displacement[0] * problem.length
+    return at(problem, u, (48, 60))[1], int(solution.iterations)
+
+
+def bending(ratio: float, cell: str, degree: int, *, mean: bool = True) -> tuple[float, int]:
     """Return the largest displacement of a cantilever 4 x 1 x 1, and the Newton iterations.
 
     A follower pressure of 0.004 E bends it by more than a third of its length. `ratio` is the bulk
-    modulus over the shear modulus. The body consists of 12 x 3 x 3 hexahedra of degree 1 or of
-    6 x 2 x 2 of degree 2, with mean dilatation or without it.
+    modulus over the shear modulus. The body consists of 12 x 3 x 3 hexahedra of degree 1, or of
+    6 x 2 x 2 of degree 2 or six tetrahedra in each, with mean dilatation or without it.
     """
     counts = [13, 4, 4] if degree == 1 else [7, 3, 3]
     law = fem.NeoHookeanIsoK2((3 * ratio - 2) / (6 * ratio + 2))
     problem = fem.Problem.build(
-        fem.box([4.0, 1.0, 1.0], counts),
+        fem.box([4.0, 1.0, 1.0], counts, cell),
         law,
         fixed=fem.Plane(0, "min"),
         degree=degree,
@@ -275,25 +300,35 @@ def locking(folder: Path) -> Section:
             Row(f"{name}, ν = {nu}", text, value)
             for nu, text, value in zip(POISSON, texts, found[name], strict=True)
         ]
-    for name, degree in (("hex8", 1), ("hex27", 2)):
-        bent = [bending(ratio, degree) for ratio in RATIOS]
+    for name, (cell, degree) in BENT.items():
+        bent = [bending(ratio, cell, degree) for ratio in RATIOS]
         limit = bent[-1][0]
         for ratio, (size, count) in zip(RATIOS, bent, strict=True):
             title = f"{name} with mean dilatation bent far, κ/μ = {ratio:g}"
             rows.append(Row(f"{title}: Newton iterations", f"< {MOST_ITERATIONS}", count))
             within = 0.02  # the compressible body is softer
             rows.append(Row(f"{title}: largest displacement", f"{limit:.4f}", size, within))
-    plain = [str(bending(ratio, 2, mean=False)[1]) for ratio in RATIOS]
+    locked = []
+    for nu in POISSON:
+        fine, (tip, count) = sheared(nu, 32, "quad")[0], sheared(nu, 8, "triangle")
+        locked.append(sheared(nu, 8, "triangle", mean=False))
+        title = f"Cook's membrane, tri6 with mean dilatation, 8 × 8, ν = {nu}"
+        rows.append(Row(f"{title}: u_y(48, 60) [mm], quad9, 32 × 32", f"{fine:.4f}", tip, 0.005))
+        rows.append(Row(f"{title}: Newton iterations", "< 8", count))
+    plain = [str(bending(ratio, "hexahedron", 2, mean=False)[1]) for ratio in RATIOS]
     _draw_locking(folder / "locking.png", found)
     return Section(
         "Nearly incompressible bodies",
         "independent code",
         "Compliance of the paper's beam, relative to hex27 on 16 × 4 × 4 cells; elements that do "
         "not lock must exceed 0.94. A cantilever bent by a follower pressure of 0.004 E is "
-        "compared with κ/μ = 1e5.",
+        "compared with κ/μ = 1e5, Cook's membrane (NHiso-k2, E = 38.5 tractions) with quad9 with "
+        "mean dilatation.",
         rows,
         "hex8 and tet4 lock; dpl warns of them. With `mean_dilatation` Newton's iterations do not "
-        f"grow with the bulk modulus; without it hex27 needs {', '.join(plain)}.",
+        f"grow with the bulk modulus; without it hex27 needs {', '.join(plain)}, and tri6 on "
+        f"Cook's membrane {', '.join(str(count) for _, count in locked)}, with tips of "
+        f"{', '.join(f'{tip:.2f}' for tip, _ in locked)} mm.",
     )
 
 
@@ -309,8 +344,10 @@ def _draw_locking(path: Path, found: dict[str, list[float]]) -> None:
             xscale="log",
         )
         away = 0.5 - np.array(POISSON)
-        for k, (name, values) in enumerate(found.items()):
-            measured(ax, away, values, k, name)
+        elements = [name.split()[0].strip(",") for name in found]
+        for element, (name, values) in zip(elements, found.items(), strict=True):
+            dashed = {"linestyle": "--"} if "mean" in name else {}
+            measured(ax, away, values, elements.index(element), name, **dashed)
             if known := [float(text) for text in LOCKING[name][3].split()]:
                 reference(ax, away, known)
         reference(ax, [], [], "independent code")

@@ -14,18 +14,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly.boundary_conditions import FoundationMatrix, Support, assemble_constraints
-from dpl.fem.assembly.discretisation import Discretisation
+from dpl.fem.assembly.discretisation import Discretisation, geometry
 from dpl.fem.assembly.elements import (
     QUADRATIC,
     QUADRATICALLY,
     basis_of,
-    gradients,
+    is_simplex,
     locking_warnings,
 )
-from dpl.fem.assembly.equilibrium import relative_norm, relative_rounding
+from dpl.fem.assembly.equilibrium import relative_norm
 from dpl.fem.assembly.follower_loads import NO_LOADS, FollowerLoad, FollowerLoads
 from dpl.fem.assembly.kernels import CompiledLoops
-from dpl.fem.assembly.mean_dilatation import CellVolumes
 from dpl.fem.assembly.recovery import Recovery
 from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_modes
 from dpl.fem.assembly.sparsity import Pattern
@@ -165,7 +164,7 @@ class Problem:
                 ranges.
             degree: Degree of the displacement, 1 or 2.
             mean_dilatation: Project the volume ratio in each cell, so that nearly incompressible
-                bodies of quadrilaterals and hexahedra do not lock, see `CellVolumes`.
+                bodies do not lock, see `CellVolumes`. Triangles and tetrahedra need degree 2.
             length: L [m]; the longest side of the body if left out.
             young: Young's modulus [Pa] by which boundary values are divided: stiffnesses of
                 foundations, follower loads, and the tractions and body forces of `dpl.fem.loads`.
@@ -177,7 +176,7 @@ class Problem:
                 boundary value is invalid, or `mean_dilatation` has no effect on the cells.
 
         Warns:
-            UserWarning: Linear elements will lock, see `locking_warnings`.
+            UserWarning: The elements will lock, see `locking_warnings`.
         """
         if degree not in (1, 2):
             raise ValueError(f"degree = {degree} must be 1 or 2")
@@ -187,10 +186,10 @@ class Problem:
         mesh, origin = near_origin(mesh)
         mesh, origin = mesh.scaled(1.0 / length), origin / length
         basis = basis_of(mesh, degree)
-        if mean_dilatation and mesh.elem.refdom.name not in ("Quadrilateral", "Hexahedral"):
+        if mean_dilatation and degree == 1 and is_simplex(mesh):
             raise ValueError(
-                "mean_dilatation: applies to quadrilaterals and hexahedra only; "
-                f"{QUADRATICALLY}; quadratic elements hardly lock"
+                "mean_dilatation = true must be used with hexahedra, quadrilaterals or quadratic "
+                f"elements; {QUADRATICALLY}, or mesh the body with hexahedra"
             )
         units = Units(length, young)
         given, springs = assemble_constraints(
@@ -206,30 +205,15 @@ class Problem:
         nu = material.largest_poisson_ratio
         for line in locking_warnings(mesh, degree, nu, mean_dilatation=mean_dilatation):
             warnings.warn(line, stacklevel=2)
-        dN, dV = gradients(basis)
-        functions = None
-        if mean_dilatation:
-            at = np.asarray(basis.global_coordinates())[:, : len(dV)].transpose(1, 2, 0)
-            both = torch.from_numpy(np.ascontiguousarray(at)), torch.from_numpy(dV.copy())
-            functions = CellVolumes.of(*both, linear=degree == 2).functions
-        boundary = np.zeros(basis.N, dtype=bool)
-        boundary[basis.get_dofs(mesh.boundary_facets()).all()] = True
         return cls(
-            mesh=mesh,
-            degree=degree,
+            **geometry(basis, degree, mean_dilatation=mean_dilatation),
             material=material,
             length=length,
             origin=origin,
-            points=torch.from_numpy(np.ascontiguousarray(basis.doflocs.T)),
-            cells=torch.from_numpy(np.ascontiguousarray(basis.element_dofs.T.astype(np.int64))),
-            dN=torch.from_numpy(np.ascontiguousarray(dN)),
-            dV=torch.from_numpy(np.ascontiguousarray(dV)),
             free=torch.from_numpy(np.isnan(given)),
             prescribed=torch.from_numpy(np.nan_to_num(given)),
-            boundary=torch.from_numpy(boundary),
             springs=springs,
             follower_loads=FollowerLoads.build(follower_loads, basis, units, material, origin),
-            volume_functions=functions,
             young=young,
         )
 
@@ -443,7 +427,7 @@ class Problem:
 
     @cached_property
     def _rounding(self) -> Tensor:
-        return relative_rounding(self.discretisation, self.material)
+        return self.discretisation.relative_rounding(self.material)
 
     # ------------------------------------------------------------------ the body at rest
 

@@ -47,69 +47,40 @@ def answer_of(problem: fem.Problem, force: torch.Tensor | None = None, **options
     return fem.solve(fem.Newton(problem, linear="superlu", **options), load)
 
 
-def test_a_condition_without_value_fixes_all_components_of_its_nodes(held):
-    """The default value, the same as `fixed`."""
-    clamped, fixed = held(fem.DirichletBC(LEFT)), held(fixed=LEFT)
-    assert torch.equal(clamped.free, fixed.free)
-    assert (~clamped.free).sum() > 0
-    assert not clamped.prescribed.any()
-    assert not clamped.moved_supports
+ZERO, X = [0.0, 0.0, 0.0], [None, 0.0, None]
+SUPPORTS = {  # region and value [m] of each condition, is x = 0 fixed, u/L at x = 0 and x = L
+    "no value is zero for all components": ([(LEFT, None)], False, {0: ZERO}),
+    "`fixed` is zero for all components": ([], True, {0: ZERO}),
+    "a component without a value is free": ([(LEFT, X)], False, {0: X}),
+    "a value is a length": ([(RIGHT, [0.4, None, -0.2])], False, {1: [0.1, None, -0.05]}),
+    "the last value applies": (
+        *([(LEFT, [0.4] * 3), (LEFT, [-0.8, None, None])], False),
+        {0: [-0.2, 0.1, 0.1]},
+    ),
+    "the last value applies, reversed": (
+        *([(LEFT, [-0.8, None, None]), (LEFT, [0.4] * 3)], False),
+        {0: [0.1] * 3},
+    ),
+    "a value overrides `fixed`": ([(LEFT, [0.4, None, None])], True, {0: [0.1, 0.0, 0.0]}),
+    "no value does not free what `fixed` holds": ([(LEFT, X)], True, {0: ZERO}),
+    "regions add up": ([(LEFT, None), (RIGHT, None)], False, {0: ZERO, 1: ZERO}),
+}
 
 
-def test_component_without_a_value_stays_free(held, dim):
-    for axis in range(dim):
-        value = [None] * dim
-        value[axis] = 0.0
-        problem = held(fem.DirichletBC(LEFT, value))
-        on_plane = problem.points[:, 0] < 1e-9
-        expected = torch.zeros(dim, dtype=torch.bool)
-        expected[axis] = True
-        assert torch.equal(~problem.free, on_plane[:, None] & expected)
-
-
-def test_value_is_a_length_in_metres(held, dim):
-    whole = held(fem.DirichletBC(RIGHT, [2, *[None] * (dim - 1)]))
-    assert whole.prescribed.max().item() == pytest.approx(0.5, rel=1e-14)
-    value = [0.4, None, -0.2][:dim]
-    problem = held(fem.DirichletBC(RIGHT, value))
-    right = problem.points[:, 0] > 1 - 1e-9
+@pytest.mark.parametrize("case", SUPPORTS)
+def test_supports_prescribe_displacements_in_metres(held, dim, case):
+    conditions, fixed, ends = SUPPORTS[case]
+    supports = [fem.DirichletBC(region, value and value[:dim]) for region, value in conditions]
+    problem = held(*supports, fixed=LEFT if fixed else None)
+    expected = torch.full(problem.shape, math.nan, dtype=torch.float64)
+    for x, value in ends.items():
+        row = [math.nan if one is None else one for one in value[:dim]]
+        expected[(problem.points[:, 0] - x).abs() < 1e-9] = torch.tensor(row, dtype=torch.float64)
     assert problem.length == pytest.approx(4.0)
-    assert problem.moved_supports
-    found = problem.prescribed[right]
-    assert_close(found[:, 0], torch.full_like(found[:, 0], 0.1), rtol=1e-14, atol=0)
-    assert not found[:, 1].any()
-    assert problem.free[right][:, 1].all()
-    assert not problem.prescribed[~right].any()
-    if dim == 3:
-        assert_close(found[:, 2], torch.full_like(found[:, 2], -0.05), rtol=1e-14, atol=0)
-
-
-def test_the_last_value_of_a_component_applies(held, dim):
-    first = fem.DirichletBC(LEFT, [0.4] * dim)
-    second = fem.DirichletBC(LEFT, [-0.8, *[None] * (dim - 1)])
-    left = held().points[:, 0] < 1e-9
-    for supports, value in (((first, second), -0.2), ((second, first), 0.1)):
-        problem = held(*supports)
-        assert_close(problem.prescribed[left][:, 0].unique(), torch.tensor([value]).double())
-        assert_close(problem.prescribed[left][:, 1].unique(), torch.tensor([0.1]).double())
-
-
-def test_a_boundary_condition_overrides_fixed_nodes(held, dim):
-    problem = held(fem.DirichletBC(LEFT, [0.4, *[None] * (dim - 1)]), fixed=LEFT)
-    left = problem.points[:, 0] < 1e-9
-    assert not problem.free[left].any()
-    assert_close(problem.prescribed[left][:, 0].unique(), torch.tensor([0.1]).double())
-    assert not problem.prescribed[left][:, 1:].any()
-
-
-def test_a_free_component_of_a_boundary_condition_does_not_free_fixed_nodes(held, dim):
-    problem = held(fem.DirichletBC(LEFT, [*[None] * (dim - 1), 0.0]), fixed=LEFT)
-    assert torch.equal(problem.free, held(fixed=LEFT).free)
-
-
-def test_supports_on_different_regions_add_up(held):
-    both = held(fem.DirichletBC(LEFT), fem.DirichletBC(RIGHT))
-    assert torch.equal(both.free, held(fixed=LEFT).free & held(fixed=RIGHT).free)
+    assert not problem.prescribed[problem.free].any()
+    found = problem.prescribed.masked_fill(problem.free, math.nan)
+    assert_close(found, expected, rtol=1e-14, atol=0, equal_nan=True)
+    assert problem.moved_supports == bool(expected.nan_to_num().any())
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from torch.testing import assert_close
 
 from dpl import fem
 from dpl.fem.loads import body_force, traction
-from dpl.fem.mesh import check_mesh
 
 NH, EPS = fem.NeoHookeanLn(0.3), np.finfo(float).eps
 CELLS = 3  # along the sides of the grids
@@ -46,17 +45,6 @@ def test_a_far_body_is_written_at_its_coordinates(kind, grid, distance):
     problem = fem.Problem.build(mesh, NH, degree=kind[1])
     assert np.abs(problem.points.numpy()).max() < 3
     assert problem.mesh_in_metres.p == pytest.approx(mesh.p, abs=2 * EPS * max(distance, 1))
-
-
-def test_far_elements_pass_the_patch_test_as_near_ones_do(kind, grid, distance):
-    """The geometry is that of the rounded coordinates: inner nodes are in balance to rounding."""
-    mesh = away(grid(kind[0], CELLS, 0.15), distance)
-    problem = fem.Problem.build(check_mesh(mesh), NH, degree=kind[1], length=1.0)
-    dim = problem.shape[1]
-    H = torch.tensor([[0.02, 0.05, -0.01], [0.03, -0.04, 0.02], [-0.02, 0.01, 0.03]]).double()
-    field = (problem.points @ H[:dim, :dim].T)[None]
-    force = problem.internal_force(field)[0]
-    assert force[~problem.boundary].norm() < problem.roundoff_bound(field)
 
 
 def test_loads_and_springs_on_a_far_body_are_those_on_a_near_one(kind, grid, distance):

@@ -20,26 +20,17 @@ def body(kind, grid) -> fem.Problem:
     return fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), degree=degree, length=4.0)
 
 
-def constant(vector):
-    """Return the field that is this vector everywhere."""
-    return lambda x: np.multiply.outer(np.asarray(vector, float), np.ones(x.shape[1:]))
-
-
-def moments(problem: fem.Problem, force: torch.Tensor) -> torch.Tensor:
-    """Return the dipole sum of x_i f_j, (D, D)."""
-    return problem.points.T @ force
-
-
 def test_constant_traction_adds_up_to_stress_times_area_in_the_middle_of_its_face(body):
+    """In units of E L^2; no node off the face is loaded."""
     dim, side = body.shape[1], 1 / body.length
-    stress = np.array([0.3, -2.0, 0.7])[:dim]
-    force = traction(body, fem.Plane(0, "max"), constant(stress))
-    area = side ** (dim - 1)
-    assert_close(force.sum(dim=0), torch.from_numpy(stress * area), rtol=1e-12, atol=1e-14)
+    stress = [0.3, -2.0, 0.7][:dim]
+    force = fem.Traction(fem.Plane(0, "max"), stress).on(body)
+    total = torch.tensor(stress, dtype=torch.float64) * side ** (dim - 1)
+    assert_close(force.sum(dim=0), total, rtol=1e-12, atol=1e-14)
     assert force[body.points[:, 0] < side - 1e-9].abs().max() < 1e-15
-    middle = np.array([side, side / 2, side / 2])[:dim]
-    expected = torch.from_numpy(np.outer(middle, stress) * side ** (dim - 1))
-    assert_close(moments(body, force), expected, rtol=1e-12, atol=1e-14)
+    middle = torch.tensor([side, side / 2, side / 2], dtype=torch.float64)[:dim]
+    dipole = body.points.T @ force
+    assert_close(dipole, torch.outer(middle, total), rtol=1e-12, atol=1e-14)
 
 
 def test_linear_traction_adds_up_to_its_integral(body):
@@ -67,37 +58,21 @@ def test_body_force_is_evaluated_where_it_acts(kind, grid):
     assert not force[1:].any()
 
 
-@pytest.fixture
-def sized(kind, grid) -> fem.Problem:
-    """A body of each kind of element with sides of 3 m, lengths over that."""
-    mesh = grid(kind[0], 3, 0.15, inside=True).scaled(3.0)
-    problem = fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), degree=kind[1])
-    assert problem.length == pytest.approx(3.0)
-    return problem
-
-
-def test_traction_is_a_stress_over_young(sized):
-    """Force over E L^2 of the value on a face of side L: the value itself, whatever L."""
-    value = [0.3, -2.0, 0.7][: sized.shape[1]]
-    force = fem.Traction(fem.Plane(0, "max"), value).on(sized)
-    assert force.sum(dim=0).tolist() == pytest.approx(value, rel=1e-12)
-    assert force[sized.points[:, 0] < 1 - 1e-9].abs().max() < 1e-15
-
-
-def test_body_force_is_a_weight_per_volume_over_young(sized):
-    """Force over E L^2 of a density [1/m] on a volume L^3: the value times L."""
-    value = [0.3, -2.0, 0.7][: sized.shape[1]]
-    force = fem.BodyForce(value).on(sized)
-    expected = [sized.length * density for density in value]
+def test_body_force_is_a_weight_per_volume_over_young(body):
+    """The force over E L^2 of a density [1/m] on a volume of 1 m^D."""
+    value = [0.3, -2.0, 0.7][: body.shape[1]]
+    force = fem.BodyForce(value).on(body)
+    expected = [density / body.length ** (body.shape[1] - 1) for density in value]
     assert force.sum(dim=0).tolist() == pytest.approx(expected, rel=1e-12)
 
 
-def test_region_of_a_traction_is_in_metres(sized):
-    far = sized.length
-    force = fem.Traction(fem.Plane(1, far), [1.0] * sized.shape[1]).on(sized)
-    assert force.sum(dim=0).tolist() == pytest.approx([1.0] * sized.shape[1], rel=1e-12)
+def test_region_of_a_traction_is_in_metres(body):
+    value = [1.0] * body.shape[1]
+    force = fem.Traction(fem.Plane(1, 1.0), value).on(body)
+    expected = [one / body.length ** (body.shape[1] - 1) for one in value]
+    assert force.sum(dim=0).tolist() == pytest.approx(expected, rel=1e-12)
     with pytest.raises(ValueError, match="no facet of the boundary"):
-        fem.Traction(fem.Plane(1, 1.234 * far), [1.0] * sized.shape[1]).on(sized)
+        fem.Traction(fem.Plane(1, 1.234), value).on(body)
 
 
 @pytest.mark.parametrize(

@@ -84,9 +84,9 @@ def check_equal(found: Tensor, expected: Tensor) -> None:
     assert (found - expected).abs().max() < CLOSE * expected.abs().max()
 
 
-def as_tensor(gap: list[np.ndarray], cells: int) -> Tensor:
+def as_tensor(gap: list[tuple[np.ndarray, np.ndarray]], cells: int) -> Tensor:
     """Return strains E (1, cells, Q, 3, 3) of the kernels' 2 E (blocks, Q, 6, SIMD_WIDTH)."""
-    rows = torch.from_numpy(gap[0]).permute(0, 3, 1, 2).flatten(0, 1)[:cells]  # (E, Q, 6)
+    rows = torch.from_numpy(gap[0][0]).permute(0, 3, 1, 2).flatten(0, 1)[:cells]  # (E, Q, 6)
     return rows[..., [[0, 3, 5], [3, 1, 4], [5, 4, 2]]][None] / 2
 
 

@@ -423,7 +423,10 @@ REMEDY = "set degree=2 with the same mesh file, or write it with order 2"
         ("hexahedron", fem.NeoHookeanLn(0.45), {}, r"ratio 0.45: .*or set mean_dilatation=true$"),
         ("hexahedron", fem.MooneyRivlinK2(0.15, 0.05, 20.0), {}, "ratio 0.4901"),  # of its moduli
         ("hexahedron", fem.NeoHookeanLn(0.449), {}, None),
-        ("tetra", fem.NeoHookeanLn(0.49), {"degree": 2}, None),
+        ("tetra", fem.NeoHookeanLn(0.49), {"degree": 2}, "ratio 0.49: set mean_dilatation=true$"),
+        ("triangle", fem.NeoHookeanLn(0.49), {"degree": 2, "mean_dilatation": True}, None),
+        ("tetra", fem.NeoHookeanLn(0.48), {"degree": 2}, None),
+        ("hexahedron", fem.NeoHookeanLn(0.49), {"degree": 2}, None),
         ("quad", fem.NeoHookeanLn(0.49), {"mean_dilatation": True}, None),
         ("hexahedron", fem.NeoHookeanLn(0.49), {"mean_dilatation": True}, None),
         (0.999, NH, {}, f"aspect ratio 20 lock in bending: {REMEDY}"),

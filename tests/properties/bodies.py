@@ -234,8 +234,7 @@ def bodies(
         counts=counts,
         grading=tuple(1.0 if even else draw(st.floats(0.6, 1.8)) for _ in counts),
         shaken=0.0 if even else draw(st.floats(0.0, SHAKEN)),
-        mean_dilatation=degree == 1
-        and cell in ("quad", "hexahedron")
+        mean_dilatation=(degree == 2) == (cell in ("triangle", "tetra"))
         and draw(st.booleans())
         and isinstance(own, DILATED),
         size=draw(logarithmic(1e-3, 1e3)),

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import skfem
@@ -9,12 +10,32 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.assembly.elements import basis_of, reference_gradients
+from dpl.fem.assembly.elements import basis_of, gradients, is_simplex, reference_gradients
 from dpl.fem.assembly.kernels import CompiledLoops, Kernels
-from dpl.fem.assembly.mean_dilatation import CellVolumes
+from dpl.fem.assembly.mean_dilatation import POINT_SHEAR, CellVolumes
 from dpl.fem.assembly.recovery import Recovery
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
+
+
+def geometry(basis: skfem.Basis, degree: int, *, mean_dilatation: bool) -> dict[str, Any]:
+    """Return the attributes of a `Discretisation` that a basis decides, by name."""
+    dN, dV = gradients(basis)
+    functions = None
+    if mean_dilatation:
+        at = np.asarray(basis.global_coordinates())[:, : len(dV)].transpose(1, 2, 0)
+        points = torch.from_numpy(np.ascontiguousarray(at))
+        linear = degree == 2 and not is_simplex(basis.mesh)
+        functions = CellVolumes.of(points, torch.from_numpy(dV.copy()), linear=linear).functions
+    boundary = np.zeros(basis.N, dtype=bool)
+    boundary[basis.get_dofs(basis.mesh.boundary_facets()).all()] = True
+    arrays = {
+        "points": basis.doflocs.T,
+        "cells": basis.element_dofs.T.astype(np.int64),
+        **{"dN": dN, "dV": dV, "boundary": boundary},
+    }
+    tensors = {key: torch.from_numpy(np.ascontiguousarray(a)) for key, a in arrays.items()}
+    return {"mesh": basis.mesh, "degree": degree, "volume_functions": functions, **tensors}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +75,10 @@ class Discretisation:
     @property
     def volumes(self) -> CellVolumes | None:
         """Polynomials of the volume change in the cells; None without mean dilatation."""
-        functions = self.volume_functions
-        return None if functions is None else CellVolumes(functions, self.dV)
+        if (functions := self.volume_functions) is None:
+            return None
+        is_reduced = self.degree == 2 and functions.shape[-1] == 1  # simplices
+        return CellVolumes(functions, self.dV, POINT_SHEAR if is_reduced else 0.0)
 
     @cached_property
     def basis(self) -> skfem.Basis:
@@ -96,8 +119,9 @@ class Discretisation:
         numbers = chosen.numpy()
         key = numbers.tobytes()
         if key not in self._kernels:
-            own = [0] if self.equal_cells else numbers
-            psi = None if self.volume_functions is None else self.volume_functions.numpy()[own]
+            own, volumes = [0] if self.equal_cells else numbers, self.volumes
+            if volumes is not None:
+                volumes = volumes._replace(functions=volumes.functions[own])
             self._kernels[key] = Kernels(
                 law,
                 cells=self.cells.numpy()[numbers],
@@ -105,7 +129,7 @@ class Discretisation:
                 dN=self.dN.numpy()[own],
                 dV=self.dV.numpy()[own],
                 places=self.pattern.places.reshape(len(self.cells), -1)[numbers],
-                functions=psi,
+                volumes=volumes,
             )
         return self._kernels[key].with_law(law)
 
@@ -148,6 +172,20 @@ class Discretisation:
         force = per_cell.new_zeros(len(per_cell), *self.shape)
         return force.index_add(1, self.cells.flatten(), per_cell.flatten(1, 2))
 
+    def relative_rounding(self, material: Material) -> Tensor:
+        """Return a bound of the rounding error of ||R_free|| over max |u|, (1,) or (B,) [-].
+
+        The bound follows from magnitudes: every nodal force is a sum of products of displacement,
+        gradient, modulus and gradient. On slivers it exceeds any tolerance.
+        """
+        size = self.dN.norm(dim=-1)  # (E or 1, Q, A)
+        terms = (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
+        modulus = material.lam + 2 * material.mu
+        terms = (modulus.to(terms) * terms[None])[..., None]  # (B or 1, E, A, 1)
+        terms = terms.expand(-1, len(self.cells), -1, self.shape[1])
+        summed = torch.where(self.free.any(dim=1), self.sum_at_nodes(terms)[..., 0], 0.0)
+        return torch.finfo(torch.float64).eps * summed.norm(dim=1)
+
     def entries(
         self, moduli: Tensor, slope: Tensor | None = None, stiffness: Tensor | None = None
     ) -> Tensor:
@@ -168,7 +206,14 @@ class Discretisation:
             slopes = torch.stack(each, dim=2)  # (B, E, M, A, D)
             volumetric = torch.einsum("bemai,bemn,benck->beaikc", slopes, stiffness, slopes)
             matrices = matrices + volumetric.flatten(-3)
-        matrices = matrices.reshape(samples, -1)  # laid out aikb
-        kept = matrices[:, self.pattern.source.to(matrices.device)]
-        values = kept.new_zeros(len(kept), len(self.pattern.indices))
-        return values.index_add(1, self.pattern.target.to(matrices.device), kept)
+        count, nnz = self.cells.shape[1], len(self.pattern.indices)
+        matrices = matrices.unflatten(-1, (dim, dim, count)).movedim(-1, 3)  # laid out abik
+        b, a = np.tril_indices(count)
+        pairs = matrices[:, :, a, b].flatten(1)
+        values = pairs.new_zeros(samples, nnz + 1)
+        return values.index_add(1, self._places.to(pairs.device), pairs)[:, :nnz]
+
+    @cached_property
+    def _places(self) -> Tensor:
+        """Positions of the entries of all cell matrices, see `Pattern.places`."""
+        return torch.from_numpy(self.pattern.places.ravel())

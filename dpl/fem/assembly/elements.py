@@ -100,6 +100,11 @@ def gradients(basis: skfem.Basis) -> tuple[Array, Array]:
     return (dN[:1], dV[:1]) if equal else (dN, dV)
 
 
+def is_simplex(mesh: skfem.Mesh) -> bool:
+    """Return True for triangles and tetrahedra."""
+    return mesh.elem.refdom.name in ("Triangular", "Tetrahedral")
+
+
 def locking_warnings(
     mesh: skfem.Mesh, degree: int, poisson: float, *, mean_dilatation: bool
 ) -> list[str]:
@@ -107,17 +112,18 @@ def locking_warnings(
 
     Args:
         mesh: The cells.
-        degree: Polynomial degree of the displacement; only linear elements lock.
+        degree: Polynomial degree of the displacement.
         poisson: Largest Poisson's ratio [-].
         mean_dilatation: Whether the volume ratio is projected in each cell.
     """
-    if degree == 2:
-        return []
     lines, shape = [], mesh.elem.refdom.name.lower()
+    locking = f"{shape} elements lock at Poisson's ratio {poisson:.4g}"
+    if degree == 2:
+        locks = poisson > 0.48 and not mean_dilatation and is_simplex(mesh)
+        return [f"quadratic {locking}: set mean_dilatation=true"] if locks else []
     if poisson >= 0.45 and not mean_dilatation:
-        can_project = shape in ("quadrilateral", "hexahedral")
-        remedy = f"{QUADRATICALLY}, or set mean_dilatation=true" if can_project else QUADRATICALLY
-        lines.append(f"linear {shape} elements lock at Poisson's ratio {poisson:.4g}: {remedy}")
+        other = "" if is_simplex(mesh) else ", or set mean_dilatation=true"
+        lines.append(f"linear {locking}: {QUADRATICALLY}{other}")
     if (aspect := float(aspect_ratio(mesh).max())) > 20:
         lines.append(
             f"linear {shape} elements of aspect ratio {aspect:.0f} lock in bending: {QUADRATICALLY}"

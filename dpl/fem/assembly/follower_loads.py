@@ -46,29 +46,19 @@ class FollowerLoad:
         """Name of the parameter of a range."""
         return self.name or self.default_name
 
-    @property
-    def range(self) -> ParameterRange | None:
-        """Range of the stress [Pa]; None if it is one number."""
-        if is_range(self.value):
+    def stress(self, units: Units) -> tuple[float, ParameterRange | None]:
+        """Return the stress over E [-], and None; NaN and its range [Pa] if loads decide it."""
+        value, ends = self.value, None
+        if is_range(value):
             try:
-                return ParameterRange.of("value", self.value)
+                ends = ParameterRange.of("value", value)
             except ValueError as error:
                 raise ValueError(f"{error}; {self.direction_hint}") from error
-        value = self.value
-        if (
-            not isinstance(value, int | float)
-            or isinstance(value, bool)
-            or not math.isfinite(value)
-        ):
+            value = ends[0]
+        if isinstance(value, bool) or not (isinstance(value, int | float) and math.isfinite(value)):
             raise ValueError(f"value = {value} must be a finite number or a range [Pa]")
-        return None
-
-    def dimensionless(self, units: Units) -> float:
-        """Return the stress over E [-]; NaN for a range, until a load says which."""
-        ends = self.range
-        one = ends[0] if ends else self.value
-        stress = float(units.stress(np.array(one, dtype=np.float64), f"value = {self.value}"))
-        return math.nan if ends else stress
+        stress = float(units.stress(np.array(value, dtype=np.float64), f"value = {self.value}"))
+        return (math.nan if ends else stress), ends
 
     def on(
         self,
@@ -188,10 +178,10 @@ class FollowerLoads:
         for load in loads:
             name = load.parameter
             try:
-                ends = load.range
+                stress, ends = load.stress(units)
                 if ends and name in (*ranges, *material.parameter_ranges):
                     raise ValueError(f"two ranges have the name {name}; set another")
-                values.append(load.dimensionless(units))
+                values.append(stress)
                 parts.append(load.on(basis, units, material, origin))
             except ValueError as error:
                 raise ValueError(f"follower_loads.{name}: {error}") from error

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly import element_loops, lanes
+from dpl.fem.assembly.mean_dilatation import CellVolumes
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.material import CompiledForm, Material
 
 Array = NDArray[np.float64]
-Gap = Array | tuple[Array, Array]  # of strains, with mean dilatation of strains and volume changes
-NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH))
-NO_VOLUME_GAP = np.zeros((0, 0, SIMD_WIDTH))
+Gap = tuple[Array, Array]  # of strains and, with mean dilatation, of volume changes
+NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH)), np.zeros((0, 0, SIMD_WIDTH))
 NO_VALUES = np.zeros(0)
 SPARE = 64  # places for entries that are not stored: additions to one place wait for each other
 AFFINE = 1e-13  # relative change of the inverse Jacobian in a cell that counts as rounding
@@ -41,7 +41,7 @@ class Kernels:
         dN: Array,
         dV: Array,
         places: NDArray[np.int32],
-        functions: Array | None = None,
+        volumes: CellVolumes | None = None,
     ) -> None:
         """Copy the arrays in blocks; numba compiles at the first call and caches the code on disk.
 
@@ -55,7 +55,7 @@ class Kernels:
             dV: Volumes of the quadrature points, (E or 1, Q).
             places: Position of each entry of a cell matrix among the nnz entries, nnz for those
                 that are not stored, (E, A (A + 1)/2 D^2).
-            functions: Functions of the volume change of mean dilatation, (E or 1, Q, M).
+            volumes: Polynomials of the volume change in the cells, with mean dilatation.
         """
         trilinear = lanes.trilinear_gradients()
         same = reference.shape == trilinear.shape and np.allclose(4 * reference, trilinear)
@@ -69,7 +69,8 @@ class Kernels:
         self.reference = None if same else np.pad(reference, [(0, 0), (0, 0), (0, missing)])
         self.inverse = _in_blocks(inverse.reshape(*inverse.shape[:2], 9))
         self.dV = _in_blocks(dV[..., None])
-        self.functions = None if functions is None else _in_blocks(functions)
+        self._volumes = volumes
+        self.functions = None if volumes is None else _in_blocks(volumes.functions.numpy())
         blocks = _in_blocks(places).astype(np.uint32)
         nnz = blocks.max()  # of entries that are not stored, which every cell matrix has
         blocks[-1, :, (len(cells) - 1) % SIMD_WIDTH + 1 :] = nnz
@@ -83,12 +84,14 @@ class Kernels:
         form = form_of(material)
         law = Law.of(form, element_loops.SOURCES)
         if self._law is None or self._law[0] != law:
-            volumetric = self.functions is not None and material.finite
+            volumetric = self._volumes is not None and material.finite
             needs = max(required_terms(form), int(volumetric))
             self._law = law, needs, float(material.finite)
         self._constants = as_columns(material.constants)
         self._frames = frames_of(material)
-        self._bulk = None if self.functions is None else as_columns([material.point_bulk])
+        self._bulk = None
+        if self._volumes is not None:
+            self._bulk = as_columns([self._volumes.point_bulk(material)])
 
     def with_law(self, material: Material) -> "Kernels":
         """Return the loops of another law over the same cells."""
@@ -96,47 +99,36 @@ class Kernels:
         other._set_law(material)
         return other
 
-    def force(self, u: Array, out: Array, member: int = 0) -> float:
-        """Add the internal force of u to `out`; return min det F.
+    def add(
+        self, u: Array, force: Array, values: Array, *, gap: Gap = NO_GAP, member: int = 0
+    ) -> float:
+        """Add force (N, D) and, unless empty, tangent (nnz + SPARE,) at u (N, D).
 
-        Args:
-            u: Displacement, (N, D).
-            out: Internal force, (N, D).
-            member: Index of the moduli, where each member of a batch has its own.
+        Returns min det F, with a gap min det C of the mixed points. Members of a batch may have
+        their own moduli.
         """
-        return self._add(member, u, None, out, NO_VALUES)
-
-    def system(self, u: Array, gap: Gap | None, out: Array, values: Array) -> float:
-        """Add force (N, D) and tangent (nnz + SPARE,) at u; return min det C of mixed points.
-
-        Raises:
-            ValueError: The members of a batch have different moduli.
-        """
-        if len(self._constants) > 1:
-            raise ValueError("parameters must be the same for all loads; linearise them one by one")
-        lowest = self._add(0, u, gap, out, values)
-        return math.inf if gap is None else lowest
-
-    def _add(self, member: int, u: Array, gap: Gap | None, out: Array, values: Array) -> float:
         law, needs, finite = self._law
-        moduli = self._constants[member if len(self._constants) > 1 else 0]
-        volumes = None
+        moduli, volumes = self._constants[member if len(self._constants) > 1 else 0], None
         if self._bulk is not None:
             volumes = self.functions, self._bulk[member if len(self._bulk) > 1 else 0]
         law_arguments = law, moduli, self._frames, needs, finite
-        arguments = *law_arguments, u, _both(gap), *self._body, volumes, self.places, out, values
+        arguments = *law_arguments, u, gap, *self._body, volumes, self.places, force, values
         return 1 + call_compiled(element_loops.add_system, *arguments)
+
+    @property
+    def n_members(self) -> int:
+        """Number of the members of a batch that have their own moduli, or 1."""
+        return len(self._constants)
 
     @property
     def _body(self) -> tuple[Any, ...]:
         """Arguments of the loops: cells and their number, gradients and volumes."""
         return (self.cells, self._n_cells), self.reference, self.inverse, self.dV
 
-    def gap_after(self, gap: Gap | None, length: float, update: Array, u: Array) -> Gap:
+    def gap_after(self, gap: Gap, length: float, update: Array, u: Array) -> Gap:
         """Return the gaps of the mixed integration points after a step (N, D) to u (N, D)."""
-        arguments = self._law[0], _both(gap), length, update, u, *self._body, self.functions
-        both = call_compiled(element_loops.update_gap, *arguments)
-        found: Gap = both[0] if self.functions is None else both
+        arguments = self._law[0], gap, length, update, u, *self._body, self.functions
+        found: Gap = call_compiled(element_loops.update_gap, *arguments)
         return found
 
 
@@ -156,17 +148,28 @@ class CompiledLoops(NamedTuple):
         displacement = displacement.detach().contiguous()
         internal = torch.zeros(displacement.shape, dtype=torch.float64)
         pairs = enumerate(zip(displacement.numpy(), internal.numpy(), strict=True))
-        lowest = [min(group.force(u, out, k) for group in self.groups) for k, (u, out) in pairs]
+        lowest = [
+            min(group.add(u, out, NO_VALUES, member=k) for group in self.groups)
+            for k, (u, out) in pairs
+        ]
         return internal, torch.tensor(lowest, dtype=torch.float64)
 
     def linearise(
         self, displacement: Tensor, gap: Sequence[Gap] | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return force (1, N, D), tangent (1, nnz) and min det C of the mixed points (1,)."""
+        """Return force (1, N, D), tangent (1, nnz) and min det C of the mixed points (1,).
+
+        Raises:
+            ValueError: The members of a batch have different moduli.
+        """
+        if any(group.n_members > 1 for group in self.groups):
+            raise ValueError("parameters must be the same for all loads; linearise them one by one")
         u = displacement[0].detach().contiguous().numpy()
         force, values = np.zeros(u.shape), np.zeros(self.n_entries + SPARE)
-        lowest = min(group.system(u, own, force, values) for group, own in self._with_gaps(gap))
+        pairs = self._with_gaps(gap)
+        lowest = min(group.add(u, force, values, gap=own) for group, own in pairs)
         tangent = torch.from_numpy(values[: self.n_entries])[None]
+        lowest = math.inf if gap is None else lowest
         return torch.from_numpy(force)[None], tangent, torch.tensor([lowest])
 
     def update_strain_gap(
@@ -181,15 +184,8 @@ class CompiledLoops(NamedTuple):
         u = np.zeros_like(step) if displacement is None else displacement[0].contiguous().numpy()
         return [group.gap_after(own, length, step, u) for group, own in self._with_gaps(gap)]
 
-    def _with_gaps(self, gap: Sequence[Gap] | None) -> Iterator[tuple[Kernels, Gap | None]]:
-        return zip(self.groups, [None] * len(self.groups) if gap is None else gap, strict=True)
-
-
-def _both(gap: Gap | None) -> tuple[Array, Array]:
-    """Return the gaps of strains and of volume changes; empty ones for none."""
-    if isinstance(gap, tuple):
-        return gap
-    return NO_GAP if gap is None else gap, NO_VOLUME_GAP
+    def _with_gaps(self, gap: Sequence[Gap] | None) -> Iterator[tuple[Kernels, Gap]]:
+        return zip(self.groups, [NO_GAP] * len(self.groups) if gap is None else gap, strict=True)
 
 
 def form_of(material: Material) -> CompiledForm:

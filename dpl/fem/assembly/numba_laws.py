@@ -3,7 +3,7 @@
 import hashlib
 import inspect
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -55,19 +55,14 @@ class Law:
         kind = None if fibres is None else type(fibres)
         return cls(type(law), counts[0], sources, kind, counts[1])
 
-    @cached_property
+    @property
     def kind(self) -> _LawType:
         """The law's type in numba."""
-        if self not in _KINDS:
-            _KINDS[self] = _kind(self)
-        return _KINDS[self]
+        return _kind(self)
 
 
-_KINDS: dict[Law, _LawType] = {}
-
-
+@cache
 def _kind(law: Law) -> _LawType:
-    """Return the type of a law."""
     functions: list[Any] = [law.material.invariant_derivatives]
     functions += [law.fibres.strain_derivatives] if law.fibres else []
     code = repr([_code_of(function) for function in functions]) + law.sources

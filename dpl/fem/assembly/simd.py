@@ -96,30 +96,20 @@ def _call(builder: Any, name: str, args: Any) -> Any:
     return builder.call(builder.module.declare_intrinsic(name, (), kind), args)
 
 
-@intrinsic
-def sqrt(typing: Any, x: Any) -> Any:
-    """Return the square root of each lane."""
+def _function(name: str) -> Any:
+    """Return one of LLVM's functions of one vector, by lanes."""
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _call(builder, "sqrt", args)
+    @intrinsic
+    def apply(typing: Any, x: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return _call(builder, name, args)
 
-    return SIMD_VECTOR(x), code
+        return SIMD_VECTOR(x), code
 
-
-@intrinsic
-def _exp(typing: Any, x: Any) -> Any:
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _call(builder, "exp", args)
-
-    return SIMD_VECTOR(x), code
+    return apply
 
 
-@intrinsic
-def _rint(typing: Any, x: Any) -> Any:
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _call(builder, "rint", args)
-
-    return SIMD_VECTOR(x), code
+sqrt, _exp, _rint = map(_function, ("sqrt", "exp", "rint"))
 
 
 @intrinsic

@@ -1,12 +1,9 @@
 """Sparsity pattern of the tangent, built once per body from its cells and free nodes."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 Integers = NDArray[np.int64]
 
@@ -65,27 +62,6 @@ class Pattern:
         codes = owner * self.size + self.indices
         found = np.searchsorted(codes, row * self.size + column)
         return np.where(row >= 0, found, len(codes))
-
-    @cached_property
-    def source(self) -> Tensor:
-        """Index of each stored entry in the cell matrices, laid out (E, A, i, k, A)."""
-        return torch.from_numpy(self._kept[0])
-
-    @cached_property
-    def target(self) -> Tensor:
-        """Position among the nnz of each stored entry of the cell matrices."""
-        return torch.from_numpy(self._kept[1])
-
-    @cached_property
-    def _kept(self) -> tuple[Integers, Integers]:
-        cells, pairs, dim, _ = self.places.shape
-        count = int((8 * pairs + 1) ** 0.5) // 2  # pairs = A (A + 1)/2
-        b, a = np.tril_indices(count)
-        i, k = np.indices((dim, dim))
-        local = ((a[:, None, None] * dim + i) * dim + k) * count + b[:, None, None]
-        source = np.arange(cells)[:, None, None, None] * (count * dim) ** 2 + local
-        kept = self.places < len(self.indices)
-        return source[kept], self.places[kept].astype(np.int64)
 
 
 def _numbered(free: NDArray[np.bool_]) -> Integers:
