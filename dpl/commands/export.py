@@ -12,10 +12,10 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+import dpl
 from dpl import config, export, training
 from dpl.commands.cli import command
 from dpl.evaluation import tables
-from dpl.scene import Scene
 from dpl.system.files import atomic_write
 from dpl.version import install
 
@@ -58,7 +58,7 @@ def main(cfg: DictConfig) -> None:
         print(f"to share: {path.parent}; dpl.load reads this folder, also as hf://OWNER/NAME")
 
 
-def publish(cfg: DictConfig, run: DictConfig, scene: Scene, folder: Path) -> Path:
+def publish(cfg: DictConfig, run: DictConfig, scene: "dpl.Scene", folder: Path) -> Path:
     """Write what `dpl.load` needs of a run to a folder; return the card."""
     every = config.to_container(run)
     kept = {key: every[key] for key in config.PREDICTION if key in every}

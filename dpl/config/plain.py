@@ -12,7 +12,11 @@ from typing import Any
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import (
+    InterpolationToMissingValueError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+)
 
 from dpl.config import validation
 from dpl.config.validation import ConfigError
@@ -50,6 +54,9 @@ def to_container(cfg: DictConfig) -> dict[str, Any]:
         raise ConfigError(f"{error.full_key} is missing; set it on the command line") from None
     except OmegaConfBaseException as error:
         message = str(error.msg or error).splitlines()[0]
+        if isinstance(error, InterpolationToMissingValueError):  # another key needs its value
+            missing = message.rpartition(": ")[2]
+            raise ConfigError(f"{missing} is missing; set it on the command line") from None
         raise ConfigError(f"{error.full_key or 'config'}: {message}") from None
 
 

@@ -63,6 +63,7 @@ def overrides(part, forces):
             "fixed=cylinder": ["fixed.radius=0.05"],
             "loads=cable": ["loads.cables=[[[5,5,5],[50,10,5],[95,5,5]],[[5,20,20],[95,20,20]]]"],
             "loads=file": [f"loads.path={forces}"],
+            "data=files": [f"data.path={forces}"],
             "loads=pressure": ["loads.region={_target_:dpl.fem.Plane,axis:2,at:max}"],
             "loads=traction": ["loads.region={_target_:dpl.fem.Plane,axis:0,at:max}"],
         }
@@ -172,8 +173,14 @@ def test_an_option_changes_only_its_group_and_passes_the_check(
     cfg = compose(*overrides(group, name), "folder=.", "run=x", command="train")
     plain.check(cfg)
     assert_holds(cfg, group, name)
-    more = {"young"} if group == "material" else {"data", "trainer"} if group == "model" else set()
+    more = {"material": {"young"}, "model": {"data", "trainer"}}.get(group, set())
+    more |= {"loads"} if (group, name) == ("data", "files") else set()  # the forces of the file
     assert {key for key in cfg if cfg[key] != usual[key]} <= {group, *more}
+
+
+def test_a_value_that_another_key_needs_is_asked_for_by_its_name(compose):
+    with pytest.raises(ConfigError, match=r"^data\.path is missing; set it on the command line$"):
+        plain.check(compose("data=files", "folder=.", "run=x", command="train"))
 
 
 def assert_holds(cfg, group, name):
