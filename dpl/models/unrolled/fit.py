@@ -211,6 +211,7 @@ class Regression:
         priors: Sequence[Tensor],
         fitted: Columns,
         held: Columns,
+        images: int,
     ) -> None:
         """Start from the linear solution.
 
@@ -220,7 +221,9 @@ class Regression:
             symmetry: Parities of values at the cells and of coordinates.
             priors: See `mechanical_maps`.
             fitted, held: Samples to fit to, and to choose by.
+            images: Number of images of each sample in `fitted`, see `fit_map`.
         """
+        self._images = images
         self._law, self._cells, self._symmetry, self._priors = law, cells, symmetry, priors
         self._sets = fitted, held
         self._present = [torch.zeros_like(part.linear) for part in self._sets]
@@ -252,7 +255,7 @@ class Regression:
         """Fit the next map; return False, without adding it, if it gains too little."""
         rows, held = (self._rows(*pair) for pair in zip(self._sets, self._present, strict=True))
         prior = self._priors[min(len(self._matrices), 1)]
-        matrix, left_out = fit_map(rows, self._symmetry, prior)
+        matrix, left_out = fit_map(rows, self._symmetry, prior, self._images)
         matrix = matrix.float().double()
         usual, proposed = (part.features.flatten(1) @ matrix for part in (rows, held))
         error = weighted_error(held.targets - proposed, held.weights)
@@ -291,6 +294,7 @@ def fit_maps(
     inverse: Tensor,
     samples: tuple[Columns, Columns],
     *,
+    copies: int,
     cells: int,
     stages: int,
 ) -> tuple[Tensor, Regression]:
@@ -305,6 +309,7 @@ def fit_maps(
         group: Symmetries of the body.
         inverse: (V^T K(0) V)^-1, (R, R).
         samples: Samples to fit to, and to choose by.
+        copies: Number of images of each sample to fit to.
         cells: Number of sample cells.
         stages: Largest number of maps after the first.
     """
@@ -323,7 +328,7 @@ def fit_maps(
         sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
         law = problem.material.of_cells(numbers).centred()
         priors = mechanical_maps(problem, numbers, sample_cells.gradients[:-1], inverse)
-        regression = Regression(law, sample_cells, symmetry, priors, *samples)
+        regression = Regression(law, sample_cells, symmetry, priors, *samples, copies)
         while len(regression.errors) <= 1 + stages and regression.add_map():
             pass
         if best is not None and regression.errors[-1] >= best[1].errors[-1]:
@@ -377,7 +382,7 @@ def fit_in_best_modes(
         )
         held = in_coordinates(linear.terms, modes, stiffness, both[1], rests[1])
         sets = fitted, held
-        options = {"cells": cells, "stages": stages}
+        options = {"copies": len(turned), "cells": cells, "stages": stages}
         numbers, found = fit_maps(problem, modes, parity[:count], group, inverse, sets, **options)
         squares = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)  # not in V
         buffers = _buffers(modes, parity[:count], stiffness, numbers, found.maps)

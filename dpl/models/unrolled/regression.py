@@ -9,7 +9,7 @@ from dpl.fem.parity import Parities, SignedOrbits
 
 RIDGES = tuple(10.0**-k for k in range(16, 2, -1))  # relative to the mean square [-]
 ROUNDING = 1e-10  # norm of a feature over the largest below which it is rounding error
-LEAST = 1e-12  # smallest part of a row that the other rows do not predict [-]
+LEAST = 1e-12  # part of a row that the other rows never predict [-]
 
 
 class Rows(NamedTuple):
@@ -54,7 +54,9 @@ class MapParities(NamedTuple):
         return SignedOrbits.of_tensors(self.parities, self.positions, per_cell, 1)
 
 
-def fit_map(rows: Rows, symmetry: MapParities, prior: Tensor) -> tuple[Tensor, Tensor]:
+def fit_map(
+    rows: Rows, symmetry: MapParities, prior: Tensor, images: int = 1
+) -> tuple[Tensor, Tensor]:
     """Return the linear map (C F D D, R) from features to targets, and left-out errors (S, R).
 
     The map is the prior plus the ridge regression of what the prior leaves, on the rows and their
@@ -62,8 +64,8 @@ def fit_map(rows: Rows, symmetry: MapParities, prior: Tensor) -> tuple[Tensor, T
     to coordinates of the same parity, so that it is the sum of a map for each parity, with fewer
     features. Each feature is divided by its root mean square before.
 
-    The left-out error of a row is its target minus the prediction by the map that is fitted to all
-    other rows. The ridge is the one of `RIDGES` with the smallest mean left-out error.
+    The left-out error of a row is its target minus the prediction by the map that is fitted to the
+    rows of all other samples. The ridge is that of `RIDGES` with the smallest mean left-out error.
 
     Sources: Hoerl, Kennard (1970), Ridge regression, Technometrics 12; Allen (1974), The
     relationship between variable selection and data augmentation, Technometrics 16 (left-out
@@ -73,6 +75,7 @@ def fit_map(rows: Rows, symmetry: MapParities, prior: Tensor) -> tuple[Tensor, T
         rows: Rows to fit to.
         symmetry: Parities of features and targets.
         prior: Map that the ridge shrinks to, (C F D D, R).
+        images: Number of rows of each sample, its images; row k S / images + s belongs to sample s.
 
     Raises:
         ValueError: The rows are not finite.
@@ -86,42 +89,58 @@ def fit_map(rows: Rows, symmetry: MapParities, prior: Tensor) -> tuple[Tensor, T
     for p, characters in enumerate(symmetry.parities.characters):
         own = symmetry.coordinates == p
         X = weights * orbits.coordinates(features, characters)
-        changes, errors = _ridge_path(X, weights * rest[:, own])
-        start = orbits.coordinates(prior[:, own].T, characters).T
-        blocks.append((own, characters, start + changes, errors))
-        squares = squares + errors.square().sum(dim=2)
+        path = _RidgePath.of(X, weights * rest[:, own], images)
+        blocks.append((own, characters, path))
+        squares = squares + path.errors.square().sum(dim=2)
     chosen = int(squares.sqrt().mean(dim=1).argmin())
     matrix, left_out = torch.zeros_like(prior), torch.empty_like(rest)
-    for own, characters, maps, errors in blocks:
-        matrix[:, own] = orbits.fields(maps[chosen].T, characters, len(prior)).T
-        left_out[:, own] = errors[chosen]
+    for own, characters, path in blocks:
+        change = path.basis @ path.solved[chosen]
+        matrix[:, own] = prior[:, own] + orbits.fields(change.T, characters, len(prior)).T
+        left_out[:, own] = path.errors[chosen]
     left_out = left_out / weights.clamp(min=torch.finfo(torch.float64).tiny)
     return matrix, torch.where(weights > 0, left_out, rows.targets - features @ matrix)
 
 
-def _ridge_path(X: Tensor, Y: Tensor) -> tuple[Tensor, Tensor]:
-    """Return maps (K, p, R) and left-out errors (K, n, R) of X (n, p) and Y (n, R) for all ridges.
+class _RidgePath(NamedTuple):
+    """Regressions of rows for all ridges.
 
-    Columns that are zero or rounding errors, as at cells that symmetries map onto themselves, have
-    no effect. A regression with fewer rows than features is solved in as many unknowns as rows:
-    (X^T X + r)^-1 X^T Y = X^T (X X^T + r)^-1 Y.
+    Attributes:
+        errors: Left-out errors, (K, n, R).
+        solved: Solutions in the basis, (K, k, R).
+        basis: (p, k): the map of ridge number j is `basis @ solved[j]`.
     """
-    size = torch.linalg.vector_norm(X, dim=0)
-    factors = torch.where(size > ROUNDING * size.max(), 1 / size, 0.0)
-    X = X * factors
-    (n, p), maps, errors = X.shape, [], []
-    values, Q = torch.linalg.eigh(X @ X.T if n <= p else X.T @ X)
-    T = Q if n <= p else X @ Q
-    squares, right = T.square(), T.T @ Y
-    for ridge in RIDGES:
-        shift = ridge * p
-        inverse = 1 / (values.clamp(min=0) + shift)
-        solved = inverse[:, None] * right
-        if n <= p:
-            maps.append(X.T @ (Q @ solved))
-            error, part = shift * (Q @ solved), shift * (squares @ inverse)
+
+    errors: Tensor
+    solved: Tensor
+    basis: Tensor
+
+    @classmethod
+    def of(cls, X: Tensor, Y: Tensor, images: int) -> "_RidgePath":
+        """Solve for X (n, p) and Y (n, R) with so many rows of each sample.
+
+        Columns that are zero or rounding errors, as at cells that symmetries map onto themselves,
+        have no effect. A regression with fewer rows than features is solved in as many unknowns as
+        rows: (X^T X + r)^-1 X^T Y = X^T (X X^T + r)^-1 Y.
+        """
+        size = torch.linalg.vector_norm(X, dim=0)
+        factors = torch.where(size > ROUNDING * size.max(), 1 / size, 0.0)
+        X = X * factors
+        is_dual = len(X) <= X.shape[1]
+        values, Q = torch.linalg.eigh(X @ X.T if is_dual else X.T @ X)
+        T = Q if is_dual else X @ Q
+        shifts = X.shape[1] * X.new_tensor(RIDGES)[:, None, None]
+        inverse = 1 / (values.clamp(min=0) + shifts[:, 0])  # (K, k)
+        solved = inverse[:, :, None] * (T.T @ Y)
+        fitted = T @ solved  # (K, n, R)
+        of_samples = T.unflatten(0, (images, -1))
+        rows = [[(a * b) @ inverse.T for b in of_samples] for a in of_samples]
+        products = torch.stack([torch.stack(row) for row in rows]).permute(3, 2, 0, 1)
+        one = torch.eye(images, dtype=X.dtype)
+        if is_dual:
+            error, part = fitted, products
         else:
-            maps.append(Q @ solved)
-            error, part = Y - T @ solved, 1 - squares @ inverse
-        errors.append(error / part.clamp(min=LEAST)[:, None])
-    return factors[:, None] * torch.stack(maps), torch.stack(errors)
+            error, part = Y - fitted, (1 + LEAST) * one - products
+        own = error.unflatten(1, (images, -1)).transpose(1, 2)  # (K, S, images, R)
+        left_out = torch.linalg.solve(part, own).transpose(1, 2).flatten(1, 2)
+        return cls(left_out, solved, factors[:, None] * (X.T @ Q if is_dual else Q))
