@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import cofactor, volume_change
@@ -32,7 +33,7 @@ class SampleCells(NamedTuple):
         R, C, D, _ = self.gradients.shape
         rows = self.gradients.reshape(R, -1)
         H = (coordinates @ rows[:-1] + rows[-1]).view(-1, C, D, D)
-        return H if D == 3 else torch.nn.functional.pad(H, (0, 1, 0, 1))
+        return H if D == 3 else pad(H, (0, 1, 0, 1))
 
     def first_features(self, linear: Tensor) -> Tensor:
         """Return `rotated_strain`, (B, C, 1, D, D), of the linear solution's H (B, C, 3, 3)."""
@@ -64,6 +65,31 @@ def cell_gradients(problem: Problem, fields: Tensor, cells: Tensor | None = None
     mean = (problem.dN * share[..., None, None]).sum(dim=1).expand(len(problem.cells), -1, -1)
     nodes = problem.cells if cells is None else problem.cells[cells]
     return fields[:, nodes].mT @ (mean if cells is None else mean[cells])
+
+
+def mechanical_maps(
+    problem: Problem, cells: Tensor, fields: Tensor, inverse: Tensor
+) -> list[Tensor]:
+    """Return the maps (C D D, R) and (2 C D D, R) to which the ridge of the fit shrinks.
+
+    The volumes of the sample cells are scaled to the volume of the body. The first map is the
+    Galerkin solution of the linear body under the stress of the rotated strain. The others are a
+    modified Newton iteration: the Galerkin solution under the stress -R^T dP.
+
+    Args:
+        problem: The body.
+        cells: Numbers of the sample cells, (C,).
+        fields: Displacement gradients of the modes at them, (R, C, D, D).
+        inverse: (V^T K(0) V)^-1, (R, R).
+    """
+    volumes = problem.dV.sum(dim=1).expand(len(problem.cells))
+    shares = volumes[cells] * (volumes.sum() / volumes[cells].sum())
+    dim, law = fields.shape[-1], problem.reference.material.of_cells(cells).centred()
+    whole = pad(fields, (0, 3 - dim, 0, 3 - dim))[:, :, None]
+    stress = law.rest_stress(whole)[:, :, 0, :dim, :dim]
+    both = torch.stack([-fields, torch.zeros_like(fields)], dim=2)
+    weighted = (shares[:, None, None] * stress, shares[:, None, None, None] * both)
+    return [part.flatten(1).T @ inverse for part in weighted]
 
 
 def rotated_strain(H: Tensor) -> Tensor:

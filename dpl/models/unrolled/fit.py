@@ -14,13 +14,13 @@ from dpl.fem.rom.reduced_stiffness import ReducedStiffness, reduced_terms
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import Symmetry, SymmetryGroup
 from dpl.models.linear_response import LinearResponse
-from dpl.models.unrolled.features import SampleCells, cell_gradients
+from dpl.models.unrolled.features import SampleCells, cell_gradients, mechanical_maps
 from dpl.models.unrolled.regression import MapParities, Rows, fit_map, weighted_error
 from dpl.scene import Sample
 
 CHUNK = 256  # samples whose fields or features are computed at a time
 SIZE_EXPONENT = -0.4  # errors count relative to the displacement to this power
-MAX_ROWS = 2**15  # samples and images to which maps are fitted
+MAX_ROWS = 2**14  # samples and images to which maps are fitted
 MAX_BYTES = 2**31  # of snapshots and images from which modes are computed, in float32
 MIN_RANK = 40  # modes; fewer are not tried
 NOISE = 5e-7  # singular value over the largest below which a mode is rounding error
@@ -195,10 +195,12 @@ def choose_cells(images: Tensor, count: int) -> Tensor:
 class Regression:
     """Fit of the maps at given sample cells, one after the other.
 
+    A map that is fitted to few samples predicts them better than others. The next map is therefore
+    fitted to states of each sample that follow from maps which are fitted to the other samples.
+
     Attributes:
         maps: The maps so far.
         errors: Weighted held-out errors of the linear solution and after each map.
-        ridges: Ridges of the maps.
     """
 
     def __init__(
@@ -206,8 +208,10 @@ class Regression:
         law: Material,
         cells: SampleCells,
         symmetry: MapParities,
+        priors: Sequence[Tensor],
         fitted: Columns,
         held: Columns,
+        images: int,
     ) -> None:
         """Start from the linear solution.
 
@@ -215,16 +219,18 @@ class Regression:
             law: The law of the cells, perhaps with ranges.
             cells: The sample cells.
             symmetry: Parities of values at the cells and of coordinates.
+            priors: See `mechanical_maps`.
             fitted, held: Samples to fit to, and to choose by.
+            images: Number of images of each sample in `fitted`, see `fit_map`.
         """
-        self._law, self._cells, self._symmetry = law, cells, symmetry
+        self._images = images
+        self._law, self._cells, self._symmetry, self._priors = law, cells, symmetry, priors
         self._sets = fitted, held
         self._present = [torch.zeros_like(part.linear) for part in self._sets]
         self._steps = [fitted.linear, held.linear]
         self._matrices: list[Tensor] = []
         self._limits: list[Tensor] = []
         self.errors = [weighted_error(held.target, held.weights)]
-        self.ridges: list[float] = []
 
     @property
     def maps(self) -> Maps:
@@ -247,22 +253,24 @@ class Regression:
 
     def add_map(self) -> bool:
         """Fit the next map; return False, without adding it, if it gains too little."""
-        rows = [self._rows(*pair) for pair in zip(self._sets, self._present, strict=True)]
-        found = fit_map(rows[0], rows[1], self._symmetry)
-        if not found.error < MIN_GAIN * self.errors[-1]:
+        rows, held = (self._rows(*pair) for pair in zip(self._sets, self._present, strict=True))
+        prior = self._priors[min(len(self._matrices), 1)]
+        matrix, left_out = fit_map(rows, self._symmetry, prior, self._images)
+        matrix = matrix.float().double()
+        usual, proposed = (part.features.flatten(1) @ matrix for part in (rows, held))
+        error = weighted_error(held.targets - proposed, held.weights)
+        if not error < MIN_GAIN * self.errors[-1]:
             return False
-        matrix = found.matrix.float().double()
         self._matrices.append(matrix)
-        steps = [part.features.flatten(1) @ matrix for part in rows]
         sizes = self._steps[0].norm(dim=1)
-        limit = LIMIT * (steps[0].norm(dim=1)[sizes > 0] / sizes[sizes > 0]).max()
+        limit = LIMIT * (usual.norm(dim=1)[sizes > 0] / sizes[sizes > 0]).max()
         self._limits.append(limit)
+        steps = rows.targets - left_out, proposed
         self._steps = [
             limit_step(step, before, limit) for step, before in zip(steps, self._steps, strict=True)
         ]
         self._present = [c + step for c, step in zip(self._present, self._steps, strict=True)]
-        self.errors.append(found.error)
-        self.ridges.append(found.ridge)
+        self.errors.append(error)
         return True
 
     def _rows(self, samples: Columns, present: Tensor) -> Rows:
@@ -283,8 +291,10 @@ def fit_maps(
     modes: Tensor,
     parity: Tensor,
     group: SymmetryGroup,
+    inverse: Tensor,
     samples: tuple[Columns, Columns],
     *,
+    copies: int,
     cells: int,
     stages: int,
 ) -> tuple[Tensor, Regression]:
@@ -297,7 +307,9 @@ def fit_maps(
         modes: V, (n, R).
         parity: Parities of the modes, (R,).
         group: Symmetries of the body.
+        inverse: (V^T K(0) V)^-1, (R, R).
         samples: Samples to fit to, and to choose by.
+        copies: Number of images of each sample to fit to.
         cells: Number of sample cells.
         stages: Largest number of maps after the first.
     """
@@ -315,8 +327,9 @@ def fit_maps(
         # rounded before the fit: the maps cancel digits, so that G must stay what it is
         sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
         law = problem.material.of_cells(numbers).centred()
-        regression = Regression(law, sample_cells, symmetry, *samples)
-        while len(regression.ridges) <= stages and regression.add_map():
+        priors = mechanical_maps(problem, numbers, sample_cells.gradients[:-1], inverse)
+        regression = Regression(law, sample_cells, symmetry, priors, *samples, copies)
+        while len(regression.errors) <= 1 + stages and regression.add_map():
             pass
         if best is not None and regression.errors[-1] >= best[1].errors[-1]:
             break
@@ -357,10 +370,11 @@ def fit_in_best_modes(
     few = inverses[: max(1, MAX_ROWS // len(rests[0]))]
     turned = [_image(every.T, one, problem.free).T for one in few]
     fits: list[tuple[float, dict[str, Tensor]]] = []
-    count = every.shape[1]
+    factors, count = linear.terms.factors(problem.reference.material), every.shape[1]
     while count:
         modes = every[:, :count]
         stiffness = ReducedStiffness(reduced_terms(linear.terms, modes), linear.terms)
+        inverse = torch.from_numpy(stiffness.inverse(factors)[0])
         # coordinates of images of the samples are those of the samples in images of the modes
         fitted = _joined(
             in_coordinates(linear.terms, images[:, :count], stiffness, both[0], rests[0])
@@ -368,8 +382,8 @@ def fit_in_best_modes(
         )
         held = in_coordinates(linear.terms, modes, stiffness, both[1], rests[1])
         sets = fitted, held
-        options = {"cells": cells, "stages": stages}
-        numbers, found = fit_maps(problem, modes, parity[:count], group, sets, **options)
+        options = {"copies": len(turned), "cells": cells, "stages": stages}
+        numbers, found = fit_maps(problem, modes, parity[:count], group, inverse, sets, **options)
         squares = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)  # not in V
         buffers = _buffers(modes, parity[:count], stiffness, numbers, found.maps)
         fits.append((found.error_with(squares), buffers))

@@ -49,17 +49,19 @@ class Unrolled(StoredBuffers):
 
     phi_0 is the rotated strain of the linear solution minus the linear one (`rotated_strain`), phi
     the stress that is not balanced, in the present and in the rotated frame (`unbalanced_stress`).
-    The matrices B are found by ridge regression on the training samples, one after the other. Each
-    iteration is a quasi-Newton iteration of the reduced equilibrium: the residual is sampled at
-    a few cells (hyper-reduction), and the preconditioner and the weights of the cells are fitted.
+    Each iteration is a quasi-Newton iteration of the reduced equilibrium: the residual is sampled
+    at a few cells (hyper-reduction), and the preconditioner and the weights of the cells are
+    fitted. The matrices B are found one after the other by ridge regression on the training
+    samples. The ridge shrinks them to the matrices of a modified Newton iteration
+    (`mechanical_maps`). It is chosen by leave-one-out errors.
 
     c_lin is the equilibrium of the linear body in the same modes as c. It differs from the linear
     solution, but the maps only ever see fields in the modes.
 
-    Number of modes and of cells, ridges and number of maps are chosen by the error of the held-out
-    samples. Each mode is even or odd under the reflections and half turns of the body
-    (`dpl.fem.parity`), and the maps commute with these, so that the answer has these symmetries
-    exactly. The fit uses the images of the samples under the others. The answer has them nearly.
+    The numbers of modes, cells and maps are chosen by the error of the held-out samples. Each mode
+    is even or odd under the reflections and half turns of the body (`dpl.fem.parity`), and the maps
+    commute with these, so that the answer has these symmetries exactly. The fit uses the images of
+    the samples under the others. The answer has them nearly.
 
     K(0)^-1 f is computed for every load by products with dense blocks, see `LinearResponse`.
 
@@ -328,7 +330,7 @@ class Unrolled(StoredBuffers):
 
         Args:
             samples: Dimensionless samples to fit to, (S, N, D).
-            held_out: Samples by whose error cells, ridges and number of maps are chosen.
+            held_out: Samples by whose error the numbers of modes, cells and maps are chosen.
 
         Raises:
             ValueError: There are too few samples, or they are not finite.
