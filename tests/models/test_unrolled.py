@@ -285,7 +285,7 @@ def test_a_map_is_the_prior_and_a_ridge_regression_and_knows_its_errors_on_unsee
     for k in range(count):
         others = every[every % (count // images) != k % (count // images)]
         expected = targets[k] - features[k].flatten() @ ridge_fit(others, ridge)
-        assert left_out[k] == pytest.approx(expected, rel=1e-5, abs=1e-6)
+        assert left_out[k] == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
 def test_fields_of_definite_parity(beam, net):
@@ -349,10 +349,17 @@ def test_a_surrogate_is_fitted_without_a_trainer(beam, tmp_path):
         L.Trainer(logger=False, enable_checkpointing=False, accelerator="cpu").fit(surrogate, data)
 
 
-def test_errors_are_estimated_within_a_factor_and_never_far_below(beam):
+@pytest.fixture(scope="module")
+def calibrated(beam):
+    """A model with enough held-out loads for its estimated errors."""
+    net = Unrolled(beam, **{**SMALL, "cells": 16})
+    net.fit(samples_of(beam, 80), samples_of(beam, 40, seed=1))
+    return net
+
+
+def test_errors_are_estimated_within_a_factor_and_never_far_below(beam, calibrated):
     """On loads that no fit has seen; tensors and compiled loops estimate alike."""
-    unseen, net = samples_of(beam, 30, seed=12), Unrolled(beam, **SMALL)
-    net.fit(samples_of(beam, 40), samples_of(beam, 30, seed=1))
+    unseen, net = samples_of(beam, 30, seed=12), calibrated
     fields, estimated = net.forward_with_errors(unseen.force)
     assert torch.equal(fields, net(unseen.force))
     ratio = estimated[:, 0] / errors(net, unseen)
@@ -363,9 +370,9 @@ def test_errors_are_estimated_within_a_factor_and_never_far_below(beam):
     assert torch.allclose(tensors, estimated, rtol=1e-3)
 
 
-def test_the_estimated_error_of_small_loads_is_not_below_rounding(beam, net):
+def test_the_estimated_error_of_small_loads_is_not_below_rounding(beam, calibrated):
     for size in (1e-3, 1e-9, 1e-150, 1e-280):
-        _, found = net.forward_with_errors(size * beam.loads.sample(3, range(4)).force)
+        _, found = calibrated.forward_with_errors(size * beam.loads.sample(3, range(4)).force)
         assert (found > 1e-6).all()
         assert (found[:, 0] < 1e-1).all()
 
