@@ -199,65 +199,116 @@ def _train(
 # ---------------------------------------------------------------------- networks of fields
 
 
-class InCoordinates(nn.Module):
-    """A regression between POD coordinates of fields, as a network of this package."""
+class Learner(nn.Module):
+    """A method of another package as a network of this package.
+
+    Attributes:
+        weights: Numbers that a prediction reads.
+    """
+
+    weights = 0
+
+    def __init__(self) -> None:
+        """Begin to record inputs."""
+        super().__init__()
+        self.seen: list[tuple[Tensor, Tensor]] | None = []
+
+    def forward(self, field: Tensor, scalars: Tensor) -> Tensor:
+        """Return outputs, (B, N, D); before the fit zeros, and the inputs are recorded."""
+        if self.seen is None:
+            return self.outputs(field, scalars)
+        self.seen.append((field, scalars))
+        return torch.zeros_like(field)
+
+    def outputs(self, field: Tensor, scalars: Tensor) -> Tensor:
+        """Return outputs, (B, N, D), of fields (B, N, D) and scalars (B, S)."""
+        raise NotImplementedError
+
+    def learn(self, sets: Sequence[Sequence[Tensor]], seconds: float) -> None:
+        """Fit to fields, scalars and wanted outputs; the second set is held out."""
+        raise NotImplementedError
+
+    def learn_from(self, predictor: Predictor, parts: Sequence[Sample], seconds: float) -> None:
+        """Fit to samples; those of the second part are held out."""
+        sets = []
+        for part in parts:
+            self.seen = []
+            with torch.no_grad():
+                predictor(part.load)
+            sets.append(
+                [*map(torch.cat, zip(*self.seen, strict=True)), predictor.examples(part)[1]]
+            )
+        self.seen = None
+        self.learn(sets, seconds)
+
+
+class InCoordinates(Learner):
+    """A regression from POD coordinates of fields, and scalars, to POD coordinates of outputs."""
 
     def __init__(self, regression: Regression) -> None:
         """Take the regression."""
         super().__init__()
-        self.regression, self.weights = regression, 0
+        self.regression = regression
 
-    def learn(self, sets: Sequence[tuple[Tensor, Tensor]], seconds: float) -> None:
-        """Fit to fields and wanted outputs, (S, N, D) each; the second set is held out."""
-        rows = sets[0]
-        self.modes = [
-            _pod(field, count) for field, count in zip(rows, (INPUTS, OUTPUTS), strict=True)
-        ]
-        X, Y, *held = (
-            (field.flatten(1) @ modes).numpy()
-            for pair in sets
-            for field, modes in zip(pair, self.modes, strict=True)
-        )
-        self.predict, count = self.regression(X, Y, tuple(held), seconds)
-        self.weights = count + sum(modes.numel() for modes in self.modes)
+    def learn(self, sets: Sequence[Sequence[Tensor]], seconds: float) -> None:
+        """Fit the regression."""
+        (fields, scalars, wanted), held = ([one.double() for one in part] for part in sets)
+        self.inputs = _pod(fields[:MAX_ROWS], INPUTS)
+        self.modes = _pod(wanted[:MAX_ROWS], OUTPUTS)
+        coordinates = fields[:MAX_ROWS].flatten(1) @ self.inputs
+        self.scale = float(coordinates.square().sum(dim=1).mean().sqrt())
+        X = self._read(fields[:MAX_ROWS], scalars[:MAX_ROWS])
+        Y = (wanted[:MAX_ROWS].flatten(1) @ self.modes).numpy()
+        known = self._read(*held[:2]), (held[2].flatten(1) @ self.modes).numpy()
+        self.predict, count = self.regression(X, Y, known, seconds)
+        self.weights = count + self.inputs.numel() + self.modes.numel()
 
-    def forward(self, field: Tensor, scalars: Tensor) -> Tensor:
+    def outputs(self, field: Tensor, scalars: Tensor) -> Tensor:
         """Return outputs, (B, N, D)."""
-        x = (field.double().flatten(1) @ self.modes[0]).numpy()
+        x = self._read(field.double(), scalars.double())
         y = torch.from_numpy(np.asarray(self.predict(x)).reshape(len(x), -1))
-        return (y @ self.modes[1].T).reshape(field.shape).to(field.dtype)
+        return (y @ self.modes.T).reshape(field.shape).to(field.dtype)
+
+    def _read(self, field: Tensor, scalars: Tensor) -> Array:
+        """Return coordinates of mean square 1, and scalars, which lie between -1 and 1."""
+        found: Array = torch.cat([field.flatten(1) @ self.inputs / self.scale, scalars], 1).numpy()
+        return found
 
 
-class FourierOperator(nn.Module):
+class FourierOperator(Learner):
     """FNO (neuraloperator) on the nodes of a box, which are the points of a regular grid."""
 
     def __init__(self, points: Tensor) -> None:
         """Find the grid of nodes (N, D)."""
-        from neuralop.models import FNO
-
         super().__init__()
-        torch.manual_seed(0)
         values = [points[:, k].mul(1e6).round().unique() for k in range(points.shape[1])]
         self.shape = [len(one) for one in values]
         places = [
             torch.searchsorted(v, points[:, k].mul(1e6).round()) for k, v in enumerate(values)
         ]
         self.order = torch.from_numpy(np.ravel_multi_index([p.numpy() for p in places], self.shape))
-        dim = points.shape[1]
-        modes = tuple(min(12, -(-n // 2) + 1) for n in self.shape)
-        self.net = FNO(modes, in_channels=dim, out_channels=dim, hidden_channels=24, n_layers=4)
-        self.weights = sum(p.numel() for p in self.net.parameters())
 
-    def learn(self, sets: Sequence[tuple[Tensor, Tensor]], seconds: float) -> None:
-        """Train on fields and wanted outputs, (S, N, D) each."""
-        fields, outputs = sets[0]
-        self.size = float(fields.square().mean().sqrt()), float(outputs.square().mean().sqrt())
-        rows = (fields / self.size[0]).float(), (outputs / self.size[1]).float()
+    def learn(self, sets: Sequence[Sequence[Tensor]], seconds: float) -> None:
+        """Train the operator; scalars are constant channels."""
+        from neuralop.models import FNO
+
+        torch.manual_seed(0)
+        fields, scalars, wanted = sets[0]
+        dim, modes = fields.shape[2], tuple(min(12, -(-n // 2) + 1) for n in self.shape)
+        channels = {"in_channels": dim + scalars.shape[1], "out_channels": dim}
+        self.net = FNO(modes, **channels, hidden_channels=24, n_layers=4)
+        self.weights = sum(p.numel() for p in self.net.parameters())
+        self.size = float(fields.square().mean().sqrt()), float(wanted.square().mean().sqrt())
+        rows = self._channels(fields, scalars), (wanted / self.size[1]).float()
         _train(self.net, self._run, *rows, seconds, batch=8)
 
-    def forward(self, field: Tensor, scalars: Tensor) -> Tensor:
+    def outputs(self, field: Tensor, scalars: Tensor) -> Tensor:
         """Return outputs, (B, N, D)."""
-        return self.size[1] * self._run((field / self.size[0]).float()).to(field.dtype)
+        return self.size[1] * self._run(self._channels(field, scalars)).to(field.dtype)
+
+    def _channels(self, field: Tensor, scalars: Tensor) -> Tensor:
+        constants = scalars[:, None].expand(-1, field.shape[1], -1)
+        return torch.cat([field / self.size[0], constants], dim=2).float()
 
     def _run(self, field: Tensor) -> Tensor:
         grid = torch.zeros(len(field), int(np.prod(self.shape)), field.shape[2])
@@ -308,10 +359,9 @@ def rivals(
                 continue
             net = build()
             predictor = kind(net, scene)
-            sets = [predictor.examples(part) for part in (train, held)]
             start = time.process_time()
             with one_thread():
-                net.learn([tuple(field.double() for field in pair) for pair in sets], seconds)
+                net.learn_from(predictor, (train, held), seconds)
             yield name, base, predictor, time.process_time() - start, net.weights
 
 

@@ -28,7 +28,7 @@ def test_a_linear_body_is_learnt_exactly_by_linear_regression(scene):
     sets = {"in range": test, "small": test, "twice": test}
     net = InCoordinates(least_squares)
     predictor = BASES["plain"](net, scene)
-    net.learn([tuple(f.double() for f in predictor.examples(part)) for part in (train, test)], 0.0)
+    net.learn_from(predictor, (train, test), 0.0)
     row = measured(("least squares", "plain", predictor, 0.0, net.weights), 40, sets)
     assert row.worst < 1e-4  # fields are rounded to float32
     assert measured(linear_solution(scene), 0, sets).worst < 1e-5
