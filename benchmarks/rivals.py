@@ -2,10 +2,9 @@
 
 Each method is fitted to the first 64, 256 and 1,024 loads of one data set and their images under
 the symmetries of the body, by one thread, and each network of another package is trained for the
-same time. Methods of other packages learn twice: the
-displacement from the force (`plain`), and the nonlinear displacement from the linear solution, with
-the whitening and the gate of this package (`linear`). Packages that are not installed are left out;
-requirements are in benchmarks/rivals.txt.
+same time. Methods of other packages learn twice: the displacement from the force (`plain`), and the
+nonlinear displacement from the linear solution, with the whitening and the gate of this package
+(`linear`). Packages that are not installed are left out; requirements are in benchmarks/rivals.txt.
 """
 
 import json
@@ -106,10 +105,8 @@ def gaussian_process(
     X, Y = X[:MAX_PROCESS], Y[:MAX_PROCESS]
     length = float(np.sqrt(np.square(X - X.mean(axis=0)).sum(axis=1).mean()))
     kernel = ConstantKernel() * RBF(length, (0.1 * length, 100 * length)) + WhiteKernel(1e-6)
-    model = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0).fit(
-        X[:1024], Y[:1024]
-    )
-    return model.predict, model.alpha_.size + X[:1024].size
+    model = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0).fit(X, Y)
+    return model.predict, model.alpha_.size + X.size
 
 
 def radial_basis(X: Array, Y: Array, held: tuple[Array, Array], _: float) -> tuple[Predict, int]:
@@ -281,11 +278,10 @@ class FourierOperator(Learner):
     def __init__(self, points: Tensor) -> None:
         """Find the grid of nodes (N, D)."""
         super().__init__()
-        values = [points[:, k].mul(1e6).round().unique() for k in range(points.shape[1])]
+        columns = _columns(points)
+        values = [column.unique() for column in columns]
         self.shape = [len(one) for one in values]
-        places = [
-            torch.searchsorted(v, points[:, k].mul(1e6).round()) for k, v in enumerate(values)
-        ]
+        places = [torch.searchsorted(*pair) for pair in zip(values, columns, strict=True)]
         self.order = torch.from_numpy(np.ravel_multi_index([p.numpy() for p in places], self.shape))
 
     def learn(self, sets: Sequence[Sequence[Tensor]], seconds: float) -> None:

@@ -124,7 +124,7 @@ class PairData(DataModule):
         )
 
     def describe(self) -> list[tuple[str, str]]:
-        """Return how many pairs are used, and their residuals."""
+        """Return the number of used pairs by split, and a line with their residuals."""
         sizes = ", ".join(f"{size:,} {split}" for split, size in self.sizes.items())
         used, total = self.residuals[self._usable], len(self.residuals)
         residuals = f"median {float(used.median()):.2g}, largest {float(used.max()):.2g}"
@@ -156,9 +156,8 @@ def read_pairs(
     body, young = scene.problem, scene.loads.moduli
     if young[0] != young[1] or scene.loads.parameter_ranges:
         raise ValueError("pairs belong to one body; young and constants of the law must be numbers")
-    points = body.length * (body.origin + body.points.numpy())
     try:
-        force, displacement = read_nodal_fields(path, names, points, units[1])
+        force, displacement = read_nodal_fields(path, names, body.points_in_metres, units[1])
         if len(force) != len(displacement):
             counts = f"{len(force)} forces and {len(displacement)} displacements"
             raise ValueError(f"there are {counts}; they must be pairs")

@@ -585,6 +585,12 @@ class Problem:
         return self.mesh.scaled(self.length).translated(self.length * self.origin)
 
     @property
+    def points_in_metres(self) -> NDArray[np.float64]:
+        """Nodes in the coordinates of the user, (N, D) [m]."""
+        points: NDArray[np.float64] = self.length * (self.origin + self.points.numpy())
+        return points
+
+    @property
     def shape(self) -> tuple[int, int]:
         """N and D."""
         return self.discretisation.shape

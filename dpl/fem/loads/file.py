@@ -53,9 +53,8 @@ class FileLoads(CombinedLoads):
     def _forces(self) -> Array:
         """Forces of the file, (S, N, D) [N]."""
         body, names = self.problem, [self.field]
-        points = body.length * (body.origin + body.points.numpy())
         try:
-            (forces,) = read_nodal_fields(self.path, names, points, self.scale)
+            (forces,) = read_nodal_fields(self.path, names, body.points_in_metres, self.scale)
             for number, force in enumerate(forces):
                 if not np.isfinite(force).all():
                     raise ValueError(f"force {number} must have finite components")

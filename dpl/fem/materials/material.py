@@ -86,7 +86,7 @@ class Material(Parametrised):
 
     @property
     def has_response(self) -> bool:
-        """Whether the law gives its stress as a function of the Green-Lagrange strain."""
+        """True for a law whose stress is a function of the Green-Lagrange strain."""
         return self.finite and type(self).response is not Material.response
 
     def stress(self, H: Tensor) -> Tensor:

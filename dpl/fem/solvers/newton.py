@@ -320,7 +320,7 @@ class LoadStepping:
 
     @property
     def exhausted(self) -> bool:
-        """Whether the next step is below the smallest one allowed."""
+        """True if the next step is below the smallest one allowed."""
         return self.step < self.min_step
 
     def accept(self) -> None:
