@@ -167,8 +167,7 @@ class Scene:
             force: Nodal forces.
             young: E. On a body with an elastic foundation or with follower loads it must be that of
                 the body, see `Problem.check_modulus`, which this function does not call.
-            parameters: Values of `Problem.parameter_ranges`, (B,) or (B, P); required if there are
-                any.
+            parameters: Values of `Problem.parameter_ranges`, (B,) or (B, P), if there are any.
         """
         dimensionless = force.double() / (young.double()[:, None, None] * self.force_unit)
         parameters = None if parameters is None else parameters.double()
@@ -215,17 +214,11 @@ class Scene:
         return hashlib.sha256(json.dumps(self.identity(), sort_keys=True).encode()).hexdigest()
 
     def matches(self, identity: Any) -> bool:
-        """Return True if a stored identity equals that of this scene.
-
-        Identities are compared as they are read from JSON: tuples as lists, 1 equal to 1.0.
-        """
+        """Return True if a stored identity equals that of this scene, both as read from JSON."""
         return bool(_plain(identity) == _plain(self.identity()))
 
     def differences(self, identity: Any) -> list[str]:
-        """Return in what an identity that was written down differs from this scene's, a line each.
-
-        What it lacks, as those of older versions do, counts as equal.
-        """
+        """Return the differences of a stored identity, a line each; entries it lacks are equal."""
         return _differences(_plain(identity), _plain(self.identity()))
 
     def describe(self) -> list[tuple[str, str]]:
@@ -240,9 +233,14 @@ class Scene:
             springs += f", {part.describe()}"
         for name, (low, high) in problem.follower_loads.ranges.items():
             springs += f", {name} from {low:.4g} to {high:.4g} Pa"
-        force, displacement = self._largest_of_a_few()
-        bends = "" if problem.moved_supports else f", linear deflection {displacement:.3g} m"
-        unit = "N" if problem.shape[1] == 3 else "N/m"
+        # constants of the law in the centre of their ranges; magnitudes of nodal forces are added
+        load = loads.sample((0, DESCRIPTION_STREAM), range(FEW))
+        force = load.force.norm(dim=2).sum(dim=1) * load.young * self.force_unit
+        largest, unit, bends = float(force.max()), "N" if problem.shape[1] == 3 else "N/m", ""
+        if not problem.moved_supports:
+            u = self.linear.reference.solve(load.force[int(force.argmax())])
+            deflection = self.length * u.norm(dim=1).max()
+            bends = f", linear deflection {float(deflection):.3g} m"
         return [
             (
                 "body",
@@ -252,29 +250,17 @@ class Scene:
             ),
             ("supports", f"{fixed:,} nodes {moved}{springs}"),
             ("law", f"{law.describe()}, {law.describe_rest(loads.moduli)}{_scale(loads.moduli)}"),
-            (
-                "loads",
-                f"{type(loads).__name__}; the largest of {FEW}: {force:.3g} {unit}{bends}",
-            ),
+            ("loads", f"{type(loads).__name__}; the largest of {FEW}: {largest:.3g} {unit}{bends}"),
         ]
-
-    def _largest_of_a_few(self) -> tuple[float, float]:
-        """Return the largest total force [N] of a few loads, and its linear deflection [m].
-
-        The total is the sum of the magnitudes of the nodal forces. Constants of the law are those
-        at the centre of their ranges.
-        """
-        load = self.loads.sample((0, DESCRIPTION_STREAM), range(FEW))
-        totals = load.force.norm(dim=2).sum(dim=1) * load.young * self.force_unit
-        k = int(totals.argmax())
-        deflection = self.linear.reference.solve(load.force[k])
-        return float(totals[k]), float(deflection.norm(dim=1).max()) * self.length
 
     def skipped_work(self) -> list[str]:
         """Return one line for each computation that this scene does not need."""
         problem, loads = self.problem, self.loads
         cells, points = len(problem.cells), problem.dV.shape[1]
-        young = _modulus(loads.moduli)
+        low, high = loads.moduli
+        young = f"E = {low:.4g} Pa"
+        if low != high:
+            young = f"E from {low:.4g} to {high:.4g} Pa{_scale(loads.moduli)}"
         lines = [f"no E input, no samples per E: u/L depends on f/(E L^2) only ({young})"]
         for name, ends in problem.material.parameter_ranges.items():
             lines.append(
@@ -301,14 +287,6 @@ class Scene:
             )
         lines.append("no factorisation for loads whose linear solution meets the tolerance")
         return lines + loads.skipped_work()
-
-
-def _modulus(moduli: ParameterRange) -> str:
-    """Return Young's modulus, or its range, as text."""
-    low, high = moduli
-    if low == high:
-        return f"E = {low:.4g} Pa"
-    return f"E from {low:.4g} to {high:.4g} Pa{_scale(moduli)}"
 
 
 def _scale(moduli: ParameterRange) -> str:

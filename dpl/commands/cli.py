@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
 from dpl import config
-from dpl.commands import dry_run, overrides
+from dpl.commands import dry_run
 from dpl.config import CONF, ConfigError, Keys
 from dpl.system.files import DataSetError
 from dpl.version import install
@@ -89,31 +89,28 @@ def command(
 
 
 def help_page(name: str, about: str, lines: Sequence[str]) -> str:
-    """Return the help of a command, see `dpl.commands.overrides` for Hydra's state.
+    """Return the help of a command within `dry_run.initialized`.
 
     Args:
         name: Name of the command's configuration.
         about: Docstring of the command's module.
         lines: Overrides. The files are those of the chosen options.
-
-    Raises:
-        ConfigError: An override cannot be applied.
     """
-    single = [line for line in lines if not overrides.parsed(line).is_sweep_override()]
-    cfg = overrides.composed(name, single)
+    single = [line for line in lines if not dry_run.parsed(line).is_sweep_override()]
+    cfg = dry_run.composed(name, single)
     chosen = {k: v for k, v in cfg.hydra.runtime.choices.items() if not k.startswith("hydra")}
     text = [*about.splitlines()]
     if chosen:
         text += ["", "GROUP=OPTION chooses an option of a group; * is chosen:", ""]
     for group, option in sorted(chosen.items()):
-        names = (f"{one}*" if one == option else one for one in overrides.options(name, group))
+        names = (f"{one}*" if one == option else one for one in dry_run.options(name, group))
         text += textwrap.wrap(
             f"{group:14} {', '.join(names)}", WIDTH, initial_indent="  ",
             subsequent_indent=" " * 17, break_on_hyphens=False,
         )  # fmt: skip
     text += ["", "KEY=VALUE changes a value, +KEY=VALUE adds one, ~KEY removes one."]
     folders = [Path(s.path) for s in cfg.hydra.runtime.config_sources if s.schema == "file"]
-    for part in overrides.defaults(name, single):
+    for part in dry_run.loader().compute_defaults_list(name, single, RunMode.RUN).defaults:
         paths = (folder / f"{part.config_path}.yaml" for folder in folders)
         if path := next(filter(Path.is_file, paths), None):
             place = f"keys of {part.package}" if part.package else "keys"
@@ -125,37 +122,40 @@ def help_page(name: str, about: str, lines: Sequence[str]) -> str:
 @contextlib.contextmanager
 def readable_errors() -> Iterator[None]:
     """Turn errors of the configuration and of files into one line and exit status 2."""
-    logging.getLogger("skfem").setLevel(logging.WARNING)
-    _quieten_lightning()
+    _quieten()
     try:
         yield
-    except (ConfigError, DataSetError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        if HydraConfig.initialized():
-            _drop_empty(Path(HydraConfig.get().runtime.output_dir))
-        sys.exit(2)
-    except YAMLError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
     except BrokenPipeError:  # the reader of the output has ended, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the exit flushes it again
         sys.exit(128 + signal.SIGPIPE)
-    except (OSError, RuntimeError) as error:
-        if (cause := _failed_access(error)) is None:
-            raise
-        print(f"error: {_describe(cause)}", file=sys.stderr)
-        sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
+    except (ConfigError, DataSetError, YAMLError, OSError, RuntimeError) as error:
+        line = " ".join(str(error).split())
+        if isinstance(error, OSError | RuntimeError):
+            cause: BaseException | None = error  # after which PyTorch or a logger raised this one
+            while cause is not None and getattr(cause, "errno", None) is None:
+                cause = cause.__cause__ or cause.__context__
+            if not isinstance(cause, OSError):
+                raise
+            line = _describe(cause)
+        print(f"error: {line}", file=sys.stderr)
+        if HydraConfig.initialized():  # remove the empty folders of a run that did not start
+            folder = Path(HydraConfig.get().runtime.output_dir)
+            with contextlib.suppress(OSError):  # not empty
+                while Path.cwd() in folder.parents:
+                    folder.rmdir()
+                    folder = folder.parent
+        sys.exit(2)
 
 
-def _quieten_lightning() -> None:
-    """Silence messages and warnings of Lightning that a user of a command cannot act on."""
+def _quieten() -> None:
+    """Silence messages and warnings that a user of a command cannot act on."""
+    logging.getLogger("skfem").setLevel(logging.WARNING)
     for name in ("lightning.pytorch", "lightning.fabric"):  # they print without it
         logging.getLogger(name).propagate = False
-    for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
-        logging.getLogger(name).setLevel(logging.WARNING)
+        logging.getLogger(f"{name}.utilities.rank_zero").setLevel(logging.WARNING)
     for message in (
         ".*LeafSpec",
         "The number of training batches",
@@ -163,15 +163,6 @@ def _quieten_lightning() -> None:
         "The dirpath has changed",
     ):
         warnings.filterwarnings("ignore", message)
-
-
-def _failed_access(error: BaseException | None) -> OSError | None:
-    """Return the failed file access after which PyTorch or a logger raised another error."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno is not None:
-            return error
-        error = error.__cause__ or error.__context__
-    return None
 
 
 def _describe(error: OSError) -> str:
@@ -184,14 +175,6 @@ def _describe(error: OSError) -> str:
         remedy = "choose another folder or change its permissions"
     where = f" for {error.filename}" if error.filename else ""
     return f"{problem}{where}; existing files are intact: {remedy} and run the same command again"
-
-
-def _drop_empty(folder: Path) -> None:
-    """Remove the empty folders that Hydra created for a run that did not start."""
-    with contextlib.suppress(OSError):  # not empty
-        while Path.cwd() in folder.parents:
-            folder.rmdir()
-            folder = folder.parent
 
 
 def extra(cfg: DictConfig, name: str) -> bool:
@@ -221,13 +204,8 @@ def require_viewer() -> None:
 def check_trainer(trainer: Any, cfg: DictConfig) -> None:
     """Check a trainer against the rest of a configuration before the training.
 
-    Args:
-        trainer: The trainer.
-        cfg: The configuration.
-
-    Raises:
-        ConfigError: A learning-rate schedule over an unlimited training, callbacks that write no
-            weights, or a sweep whose training starts processes that would run the sweep again.
+    Refuses a learning-rate schedule over an unlimited training, callbacks that write no weights,
+    and a sweep whose training starts processes that would run the sweep again.
     """
     from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 

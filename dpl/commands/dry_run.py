@@ -1,18 +1,24 @@
 """Compose and check all jobs of a command line before Hydra starts the first one."""
 
 import contextlib
+import difflib
 import logging
+import re
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+import hydra
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path, get_args_parser
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.core.utils import configure_log
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -20,23 +26,22 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dpl import config
-from dpl.commands import overrides
-from dpl.config import ConfigError
+from dpl.config import ConfigError, validation
+from dpl.version import install
 
 REMOTE = "submitit"  # launchers on other machines, whose hardware may differ
 SAME = ("seed", "run", "folder")  # keys on which the validity of a job does not depend
+EXTRAS = {"hydra/launcher": "launch", "hydra/sweeper": "sweep"}  # groups with options of plugins
+SIMILAR = 0.8  # ratio of `difflib` from which a key is taken for a misspelt one
+GROUP = re.compile(r"fixed=([\w.:][\w .:+-]*)")  # an option, or a name that needs no quotes
+REFUSED = (HydraException, OmegaConfBaseException, ValueError, AssertionError, TypeError)
 
 
 def arguments_of(line: Sequence[str], name: str, conf: Path) -> Namespace:
-    """Return the flags and overrides of a command line.
+    """Return the flags and overrides of a command line without the name of the program.
 
-    Args:
-        line: The command line without the name of the program.
-        name: Name of the command's configuration; `--config-name` replaces it.
-        conf: Folder of the configurations; `--config-path` replaces it.
-
-    Raises:
-        ConfigError: A flag does not exist.
+    The flags `--config-name` and `--config-path` replace the name and the folder of the command's
+    configuration.
     """
 
     def refuse(message: str) -> NoReturn:
@@ -54,7 +59,7 @@ def arguments_of(line: Sequence[str], name: str, conf: Path) -> Namespace:
 def initialized(args: Namespace) -> Iterator[Hydra]:
     """Let Hydra search the folder of the configurations and that of `--config-dir`.
 
-    Replaces the override `fixed=GROUP` of a group of the mesh.
+    The override `fixed=GROUP` of a group of the mesh becomes `fixed=tag fixed.name=GROUP`.
     """
     search = create_config_search_path(str(Path(args.config_path).absolute()))
     if args.config_dir is not None:
@@ -64,7 +69,11 @@ def initialized(args: Namespace) -> Iterator[Hydra]:
         search.prepend("command-line", f"file://{own}", SearchPathQuery(provider="schema"))
     try:
         engine = Hydra.create_main_hydra2(args.config_name, search)
-        args.overrides = overrides.with_named_region(args.config_name, args.overrides)
+        for k, line in reversed([*enumerate(args.overrides)]):
+            if not (named := GROUP.fullmatch(line)):
+                continue
+            if named[1] not in ("null", *options(args.config_name, "fixed")):
+                args.overrides[k : k + 1] = ["fixed=tag", f"fixed.name={named[1]}"]
         yield engine
     finally:
         GlobalHydra.instance().clear()
@@ -86,25 +95,23 @@ def check(
 
     Returns:
         The configuration of a single job with the node `hydra`, None for a sweep.
-
-    Raises:
-        ConfigError: An override or a job is invalid.
     """
     first, jobs = _jobs(args)
     if args.cfg or args.info is not None:
         return None
     with config.error_in("run", OmegaConfBaseException):
         first.hydra.run.dir  # noqa: B018  # raises if `run` is no text
-    every = [overrides.job(cfg) for cfg in jobs or [first]]
-    for cfg in every:
+    different = {}
+    for job in jobs or [first]:
+        cfg = OmegaConf.masked_copy(job, [key for key in job if key != "hydra"])
+        if "folder" in cfg and OmegaConf.is_interpolation(cfg, "folder"):
+            cfg.folder = "."  # the node `hydra` sets it later
         config.check(cfg, keys=keys)
+        node = OmegaConf.to_container(cfg)
+        different[str({key: node[key] for key in node if key not in SAME})] = cfg
     if jobs is None:
         return first
     if rehearse is not None and REMOTE not in str(first.hydra.launcher):
-        different = {
-            str({k: v for k, v in OmegaConf.to_container(cfg).items() if k not in SAME}): cfg
-            for cfg in every
-        }
         logging.disable(logging.INFO)  # trainers describe the machine again in each job
         try:
             for cfg in different.values():
@@ -122,7 +129,7 @@ def run(
     The folders of the jobs of a sweep are named by the keys that are swept.
     """
     if cfg is None:
-        every = map(overrides.parsed, args.overrides)
+        every = map(parsed, args.overrides)
         fixed = [f"'{one.key_or_group}'" for one in every if not one.is_sweep_override()]
         names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]"
         engine.multirun(args.config_name, task, [*args.overrides, "hydra.mode=MULTIRUN", names])
@@ -137,10 +144,10 @@ def _jobs(args: Namespace) -> tuple[DictConfig, list[DictConfig] | None]:
 
     The jobs of a search are not known in advance: one without the searched keys represents them.
     """
-    every = [overrides.parsed(line) for line in args.overrides]
+    every = [parsed(line) for line in args.overrides]
     fixed = [one.input_line for one in every if not one.is_sweep_override()]
     swept = [one for one in every if one.is_sweep_override()]
-    first = overrides.composed(args.config_name, fixed)
+    first = composed(args.config_name, fixed)
     if not args.multirun and first.hydra.mode != RunMode.MULTIRUN:
         if swept:
             raise ConfigError(
@@ -152,7 +159,66 @@ def _jobs(args: Namespace) -> tuple[DictConfig, list[DictConfig] | None]:
         return first, [first]
     given = {one.key_or_group for one in every}
     params = first.hydra.sweeper.get("params") or {}
-    swept += [overrides.parsed(f"{k}={v}") for k, v in params.items() if k not in given]
+    swept += [parsed(f"{k}={v}") for k, v in params.items() if k not in given]
     with config.error_in("hydra/sweeper", HydraException):
         (jobs,) = BasicSweeper.split_arguments(swept, None)
-    return first, [overrides.composed(args.config_name, [*fixed, *job]) for job in jobs]
+    return first, [composed(args.config_name, [*fixed, *job]) for job in jobs]
+
+
+def loader() -> Any:
+    """Return Hydra's loader of configurations, which is there while it is initialized."""
+    return GlobalHydra.instance().config_loader()
+
+
+def options(name: str, group: str) -> list[str]:
+    """Return the options of a group of a command; none if the group does not exist."""
+    path = group.partition("@")[0]
+    return sorted(loader().get_group_options(path, ObjectType.CONFIG, config_name=name))
+
+
+def parsed(line: str) -> Override:
+    """Return an override; raise a `ConfigError` if it cannot be parsed."""
+    try:
+        return OverridesParser.create(config_loader=loader()).parse_override(line)
+    except HydraException as error:
+        if "=" not in line:
+            raise ConfigError(f"{line} must be written as KEY=VALUE") from error
+        key = line.partition("=")[0]
+        raise ConfigError(f"{line} cannot be read; quote the value: '{key}=\"...\"'") from error
+
+
+def composed(name: str, lines: Sequence[str]) -> DictConfig:
+    """Return the configuration of a command with overrides, including the node `hydra`.
+
+    Raises a `ConfigError` if an override cannot be applied: with the most similar key of the same
+    node if there is one, else with the message of Hydra.
+    """
+    try:
+        cfg = hydra.compose(name, overrides=list(lines), return_hydra_config=True)
+    except REFUSED as error:
+        _check_spelling(name, lines, str(error))
+        message = str(error).partition("Config search path")[0].splitlines()
+        text = " ".join(line.strip() for line in message if line and "full_key" not in line)
+        for group, extra in EXTRAS.items():
+            text += f"; more come with {install(extra)}" if f"'{group}/" in text else ""
+        raise ConfigError(text) from error
+    keys = {line[1:].lstrip("+").partition("=")[0] for line in lines if line[0] == "+"}
+    if new := {key for key in keys if "." not in key and not options(name, key)}:
+        known = {str(key) for key in hydra.compose(name)}
+        validation.refuse_unknown("", sorted(new), known, "this command has no such key")
+    return cfg
+
+
+def _check_spelling(name: str, lines: Sequence[str], message: str) -> None:
+    """Raise a `ConfigError` if the key that Hydra refuses resembles a key of the same node."""
+    if found := re.match(r"Could not override '((?:([\w.]+)\.)?(\w+))'", message):
+        others = [line for line in lines if not line.startswith(f"{found[1]}=")]
+        try:
+            cfg = hydra.compose(name, overrides=others)
+        except REFUSED:  # its message names the first of several
+            return
+        node = OmegaConf.select(cfg, found[2]) if found[2] else cfg
+        known = [*map(str, node)] if isinstance(node, DictConfig) else []
+        if near := difflib.get_close_matches(found[3], known, 1, SIMILAR):
+            place = ".".join(filter(None, (found[2], near[0])))
+            raise ConfigError(f"{found[1]}: there is no such key; did you mean {place}?")

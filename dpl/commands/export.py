@@ -118,14 +118,11 @@ def _test_errors(folder: Path) -> dict[str, float] | None:
     path = folder / "evaluation.json"
     if not path.is_file():
         return None
-    try:
+    repeat = f"repeat it with python scripts/evaluate.py run={folder}, or remove the file"
+    damaged = ValueError, KeyError, TypeError, AttributeError
+    with config.error_in(f"run: {path} is not an evaluation; {repeat}", *damaged):
         rows = {row["solver"]: row["errors"] for row in json.loads(path.read_text())}
         return {str(key): float(value) for key, value in rows[PREDICTION].items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise config.ConfigError(
-            f"run: {path} is not an evaluation; repeat it with python scripts/evaluate.py "
-            f"run={folder}, or remove the file"
-        ) from error
 
 
 def export_results(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder: Path) -> None:

@@ -5,9 +5,8 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -69,18 +68,18 @@ def main(cfg: DictConfig) -> float | None:
 
 
 def _train(cfg: DictConfig) -> float | None:
-    # imported here, since worker processes import this module without needing them
+    # imported here, since worker processes import this module without needing it
     import torch
-    from lightning.pytorch.loggers import TensorBoardLogger
 
     from dpl.config.resume import OF_GRADIENT_DESCENT
 
     folder = Path(cfg.folder)
     scene, module, surrogate, trainer = parts(cfg)
-    unused = OF_GRADIENT_DESCENT if surrogate.predictor.is_closed_form else ()
+    is_fitted, first = surrogate.predictor.is_closed_form, trainer.is_global_zero
+    unused = OF_GRADIENT_DESCENT if is_fitted else ()
     session = training.LogHyperparameters(config.hyperparameters(cfg, without=unused))
     trainer.callbacks.append(session)
-    if trainer.is_global_zero:
+    if first:
         verbose = cli.extra(cfg, "verbose")
         config.show_plan(scene, module, surrogate, folder=_from_here(folder), verbose=verbose)
         _show_unused(surrogate, unused)
@@ -88,14 +87,15 @@ def _train(cfg: DictConfig) -> float | None:
             config.save_config(cfg, folder, without=unused)
     smallest: float | None = None
     try:
-        if surrogate.predictor.is_closed_form:
-            smallest = _fit(surrogate, module, trainer, folder)
-        else:
+        if not is_fitted:
             path = cfg.ckpt_path or None
             trainer.fit(surrogate, datamodule=module, ckpt_path=path, weights_only=True)
+        elif first:  # of several processes
+            kept = None if trainer.fast_dev_run else folder
+            smallest = training.fit(surrogate, module, trainer=trainer, folder=kept)
     except (SystemExit, KeyboardInterrupt) as leaving:
         # Lightning turns Ctrl-C and SIGTERM into SystemExit, without the status
-        if trainer.is_global_zero and session.begun:
+        if first and session.begun:
             words = [_script("train"), _run_key(folder), "ckpt_path=last", *session_overrides()]
             print(f"to resume: {' '.join(words)}", file=sys.stderr)
         terminated = 128 + signal.SIGTERM
@@ -112,8 +112,28 @@ def _train(cfg: DictConfig) -> float | None:
         module.teardown("fit")  # Lightning does not call it after Ctrl-C
     if torch.distributed.is_initialized():  # only the first process evaluates
         torch.distributed.destroy_process_group()
-    if not trainer.is_global_zero or trainer.fast_dev_run:
+    if not first or trainer.fast_dev_run:
         return None
+    _evaluate(cfg, scene, trainer, session)
+    return cli.best_error(trainer) if smallest is None else smallest
+
+
+def _show_unused(surrogate: "dpl.Surrogate", unused: tuple[str, ...]) -> None:
+    """Print which overrides have no effect on a model that is fitted."""
+    lines = [line.lstrip("+") for line in HydraConfig.get().overrides.task]
+    others = "trainer=", "trainer.accelerator", "trainer.fast_dev_run"  # hardware, rehearsals
+    given = [one for one in lines if one.startswith(unused) and not one.startswith(others)]
+    if given:
+        name = type(surrogate.net).__name__
+        why = f"{name} is fitted by regression; choose a network, for example model=fcnn"
+        print(f"note: {', '.join(given)}: no effect, since {why}", file=sys.stderr)
+
+
+def _evaluate(cfg: DictConfig, scene: "dpl.Scene", trainer: Any, session: Any) -> None:
+    """Evaluate the best weights of a run on its test set, and show what to do with the run."""
+    from lightning.pytorch.loggers import TensorBoardLogger
+
+    folder = Path(cfg.folder)
     try:
         _, best = config.load_run(folder, trust=True, scene=scene)
     except config.ConfigError as error:  # its weights or answers are not finite
@@ -128,39 +148,12 @@ def _train(cfg: DictConfig) -> float | None:
         logs = any(isinstance(one, TensorBoardLogger) for one in trainer.loggers)
         show_next_commands(folder, tensorboard=logs)
     if cli.extra(cfg, "view"):
-        _view(best, folder)
-    return cli.best_error(trainer) if smallest is None else smallest
+        from dpl import viewer
+        from dpl.commands.view import serve
 
-
-def _show_unused(surrogate: "dpl.Surrogate", unused: Sequence[str]) -> None:
-    """Print which overrides have no effect on a model that is fitted."""
-    lines = [line.lstrip("+") for line in HydraConfig.get().overrides.task]
-    others = "trainer=", "trainer.accelerator", "trainer.fast_dev_run"  # hardware, rehearsals
-    given = [one for one in lines if one.startswith(tuple(unused)) and not one.startswith(others)]
-    if given:
-        name = type(surrogate.net).__name__
-        why = f"{name} is fitted by regression; choose a network, for example model=fcnn"
-        print(f"note: {', '.join(given)}: no effect, since {why}", file=sys.stderr)
-
-
-def _fit(
-    surrogate: "dpl.Surrogate", module: "data.DataModule", trainer: Any, folder: Path
-) -> float:
-    """Fit a model in closed form, in the first of several processes; return its smallest error."""
-    if not trainer.is_global_zero:
-        return math.inf
-    kept = None if trainer.fast_dev_run else folder
-    return training.fit(surrogate, module, trainer=trainer, folder=kept)
-
-
-def _view(surrogate: "training.TrainedSurrogate", folder: Path) -> NoReturn:
-    """Serve the page of a trained surrogate at any free port until Ctrl-C."""
-    from dpl import viewer
-    from dpl.commands.view import serve
-
-    policy = viewer.AccessPolicy.bind("127.0.0.1", 0, [])
-    body = viewer.Body(dpl.Simulator(surrogate))
-    serve(body, policy, title=_from_here(folder), folder=folder / "view")
+        policy = viewer.AccessPolicy.bind("127.0.0.1", 0, [])  # any free port
+        body = viewer.Body(dpl.Simulator(best))
+        serve(body, policy, title=_from_here(folder), folder=folder / "view")
 
 
 def show_next_commands(folder: Path, *, tensorboard: bool) -> None:
@@ -169,9 +162,8 @@ def show_next_commands(folder: Path, *, tensorboard: bool) -> None:
     print(f"  {_script('view')} {_run_key(folder)}      # in the browser")
     print(f"  {_script('evaluate')} {_run_key(folder)}  # this table")
     if tensorboard:
-        own = _own_folder()
-        program = str(own / "tensorboard") if own else "tensorboard"
-        print(f"  {program} --logdir {shlex.quote(_from_here(folder))}", flush=True)
+        logs = shlex.quote(_from_here(folder))
+        print(f"  {_program('tensorboard')} --logdir {logs}", flush=True)
 
 
 def session_overrides() -> list[str]:
@@ -205,16 +197,15 @@ def _run_key(folder: Path) -> str:
     return f"run={here}" if re.fullmatch(r"[\w./-]+", here) else shlex.quote(f"run='{here}'")
 
 
-def _own_folder() -> Path | None:
-    """Return the folder of this interpreter if it lies in the working directory."""
-    own = Path(sys.executable).parent
-    return own.relative_to(Path.cwd()) if Path.cwd() in own.parents else None
+def _program(name: str) -> str:
+    """Return the text that calls a program of this interpreter's environment."""
+    own = Path(sys.executable).with_name(name)
+    return str(own.relative_to(Path.cwd())) if Path.cwd() in own.parents else name
 
 
 def _script(name: str) -> str:
     """Return the text that calls a command, a script of a checkout or an installed program."""
-    own, script = _own_folder(), Path(sys.argv[0])
-    if script.suffix == ".py":
-        program = str(own / "python") if own else "python"
-        return f"{program} {_from_here(script.with_name(f'{name}.py'))}"
-    return f"{own}/dpl-{name}" if own else f"dpl-{name}"
+    script = Path(sys.argv[0])
+    if script.suffix != ".py":
+        return _program(f"dpl-{name}")
+    return f"{_program('python')} {_from_here(script.with_name(f'{name}.py'))}"

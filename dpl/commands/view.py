@@ -29,14 +29,7 @@ def main(cfg: DictConfig) -> None:
 def serve(
     body: "viewer.Body", policy: "viewer.AccessPolicy", *, title: str, folder: Path
 ) -> NoReturn:
-    """Serve the page of a body until Ctrl-C.
-
-    Args:
-        body: The body.
-        policy: Access policy with a bound socket.
-        title: Title of the page.
-        folder: Folder of recordings.
-    """
+    """Serve the page of a body until Ctrl-C; recordings are written to a folder."""
     import torch
 
     torch.set_num_threads(1)

@@ -1,26 +1,22 @@
 """Build scenes, surrogates and trainers from configurations.
 
-Only this folder and `dpl.commands` import Hydra.
+All functions raise a `ConfigError` that names the invalid key. Only this folder and `dpl.commands`
+import Hydra.
 """
 
-import contextlib
-import datetime
 import functools
-import re
 import sys
 import textwrap
 import typing
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import hydra
-import skfem
 import torch
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
 
 from dpl import models, training
 from dpl.config import validation
@@ -30,7 +26,7 @@ from dpl.fem import Heterogeneous, Material, ParameterRange, Problem, SingularMa
 from dpl.fem.assembly.follower_loads import FollowerLoad
 from dpl.fem.units import Units
 from dpl.scene import Scene
-from dpl.system.blas import slow_blas
+from dpl.system.threads import slow_blas
 
 if typing.TYPE_CHECKING:
     import lightning as L
@@ -40,7 +36,6 @@ SCENE = (  # keys of a scene; those of a surrogate
     *("material", "young", "loads", "solver"),
 )
 NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
-TIME = re.compile(r"(?:(\d+):)?(\d+):(\d\d):(\d\d)")  # [DD:]HH:MM:SS
 WIDTH = 100  # characters of a line of the plan
 CANNOT_BE_MADE = (  # errors of a call with invalid arguments
     *(InstantiationException, ValueError, TypeError, ArithmeticError, LookupError),
@@ -55,10 +50,6 @@ def instantiate(cfg: DictConfig, key: str, /, **more: Any) -> Any:
         cfg: The configuration.
         key: Key of the node.
         **more: Arguments of the call; of a partial (`_partial_: true`), those of its call.
-
-    Raises:
-        ConfigError: The node or its file does not exist, an argument is out of range, or the object
-            has another type than the key requires.
     """
     require_keys(cfg, key)
     made = _made(cfg[key], key, more)
@@ -95,14 +86,16 @@ def _of_kind(made: Any, key: str, place: str) -> Any:
 
 
 def build_scene(cfg: DictConfig) -> Scene:
-    """Return the scene of a configuration; raise a `ConfigError` that names the invalid key."""
+    """Return the scene of a configuration."""
     require_keys(cfg, *SCENE)
     law, ends = law_and_moduli(cfg)
-    forces = _parts(cfg, "forces")
+    forces, dead = _parts(cfg, "forces"), []
     follower = {name: f for name, f in forces.items() if isinstance(f, FollowerLoad)}
     problem = _problem(cfg, law, ends[0] if ends[0] == ends[1] else None, follower)
-    dead = {name: force for name, force in forces.items() if name not in follower}
-    always = _constant_force(dead, problem)
+    for name, force in forces.items():
+        with error_in(f"forces.{name}"):
+            dead += [] if name in follower else [force.on(problem)]
+    always = torch.stack(dead).sum(dim=0) if dead else None  # (N, D) [-]
     solver = instantiate(cfg, "solver", problem=problem)
     linear = solver.linear_solver
     loads = instantiate(cfg, "loads", linear=linear, young=ends, constant_force=always)
@@ -124,89 +117,59 @@ def law_and_moduli(cfg: DictConfig) -> tuple[Material, ParameterRange]:
       with fibres are over E.
 
     Where constants have ranges, their middles decide.
-
-    Raises:
-        ConfigError: The law, its regions or `young` are invalid.
     """
-    law, regions = _law(cfg), _parts(cfg, "regions")
-    if isinstance(law, dict):
-        try:
-            law = Heterogeneous(law, regions)
-        except ValueError as error:  # its message names the key
-            raise ConfigError(str(error)) from error
-    elif regions:
+    regions = _parts(cfg, "regions")
+    if validation.names_several("material", cfg.material):
+        laws = _parts(cfg, "material")
+        with error_in(""):
+            law: Any = Heterogeneous(laws, regions)
+    else:
+        law = instantiate(cfg, "material")
+    if regions and not isinstance(law, Heterogeneous):
         raise ConfigError("regions: the body has one law; give each region one, material.NAME")
     if cfg.young is None:
         with error_in("young = null: material"):
             young = law.young_at_rest
             return law.over(young), ParameterRange(young, young)
     given = OmegaConf.to_container(cfg.young) if OmegaConf.is_config(cfg.young) else cfg.young
-    try:
+    with error_in(""):
         moduli = ParameterRange.of_young(typing.cast("Any", given))
-    except ValueError as error:  # its message names the key
-        raise ConfigError(str(error)) from error
     with error_in("material"):
         return law.normalised(), moduli
-
-
-def _law(cfg: DictConfig) -> Any:
-    """Return the law, or the laws of regions by name."""
-    several = validation.names_several("material", cfg.material)
-    return _parts(cfg, "material") if several else instantiate(cfg, "material")
-
-
-def _constant_force(dead: dict[str, Any], problem: Problem) -> Tensor | None:
-    """Return the sum of the tractions and body forces, (N, D) [-]; None if there are none."""
-    forces = []
-    for name, part in dead.items():
-        with error_in(f"forces.{name}"):
-            forces.append(part.on(problem))
-    return torch.stack(forces).sum(dim=0) if forces else None
-
-
-def _supports(cfg: DictConfig, mesh: skfem.Mesh, units: Units) -> list[Any]:
-    """Return the supports; raise a `ConfigError` that names the one with an invalid value."""
-    supports = _parts(cfg, "supports")
-    for name, support in supports.items():
-        with error_in(f"supports.{name}"):
-            support.dimensionless(mesh.dim(), units)
-    return list(supports.values())
 
 
 def _problem(
     cfg: DictConfig, law: Material, young: float | None, follower: Mapping[str, FollowerLoad]
 ) -> Problem:
-    with _shown_warnings():
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always", UserWarning)
         mesh = instantiate(cfg, "mesh")
         fixed = instantiate(cfg, "fixed") if cfg.get("fixed") is not None else None
+        supports = _parts(cfg, "supports")
+        for name, support in supports.items():
+            with error_in(f"supports.{name}"):
+                support.dimensionless(mesh.dim(), Units(1.0, young))
         options = {key: cfg[key] for key in ("degree", "mean_dilatation")} | {"young": young}
-        supports = _supports(cfg, mesh, Units(1.0, young))
         options["follower_loads"] = [
             replace(typing.cast("Any", load), name=load.name or name)
             for name, load in follower.items()
         ]
         try:
-            problem = Problem.build(mesh, law, fixed=fixed, supports=supports, **options)
+            problem = Problem.build(
+                mesh, law, fixed=fixed, supports=list(supports.values()), **options
+            )
         except ValueError as error:
             message = str(error).replace("follower_loads", "forces", 1)
-            key = "fixed or supports: " if cfg.supports else "fixed: "
+            key = "fixed or supports: " if supports else "fixed: "
             named = message.startswith((*options, "regions", "material", "forces"))
             raise ConfigError(message if named else key + message) from error
+    for line in {str(w.message): None for w in warned if w.category is UserWarning}:
+        print(f"warning: {line}", file=sys.stderr)
     if not problem.free.any():
         raise ConfigError("fixed or supports: all nodes are fixed; fix fewer nodes")
     if loose := problem.unconstrained_rigid_body_modes():
         raise ConfigError(f"fixed: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}")
     return problem
-
-
-@contextlib.contextmanager
-def _shown_warnings() -> Iterator[None]:
-    """Print the warnings of the block to stderr, each once and in one line."""
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always", UserWarning)
-        yield
-    for line in {str(w.message): None for w in warned if w.category is UserWarning}:
-        print(f"warning: {line}", file=sys.stderr)
 
 
 def _parts(cfg: DictConfig, key: str) -> dict[str, Any]:
@@ -218,17 +181,15 @@ def _parts(cfg: DictConfig, key: str) -> dict[str, Any]:
         raise ConfigError(
             f"{key} = {node!r} must be a mapping of names to calls: {key}: {{name: {{...}}}}"
         )
-    places = {str(name): f"{key}.{name}" for name in node if node[name]}
     return {
-        name: _of_kind(_made(node[name], place, {}), key, place) for name, place in places.items()
+        str(name): _of_kind(_made(node[name], f"{key}.{name}", {}), key, f"{key}.{name}")
+        for name in node
+        if node[name]
     }
 
 
 def build_surrogate(cfg: DictConfig, scene: Scene) -> "training.Surrogate":
-    """Return the untrained surrogate of a configuration; its weights are a function of `seed`.
-
-    Raises a `ConfigError` that names the key if it cannot be built.
-    """
+    """Return the untrained surrogate of a configuration; its weights are a function of `seed`."""
     require_keys(cfg, *NETWORK)
     # optimiser and schedule are built once for one number: they fail before any solve
     trial = instantiate(cfg, "optimizer", params=[torch.nn.Parameter(torch.zeros(1))])
@@ -246,10 +207,7 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "training.Surrogate":
 
 
 def build_trained(cfg: DictConfig, scene: Scene) -> "training.TrainedSurrogate":
-    """Return the surrogate of a configuration without its training, for weights that are loaded.
-
-    Raises a `ConfigError` that names the key if it cannot be built.
-    """
+    """Return the surrogate of a configuration without its training, for weights that are loaded."""
     torch.manual_seed(cfg.get("seed", 0))
     net, predictor = _network(cfg, scene)
     with error_in("model"):
@@ -264,40 +222,22 @@ def _network(cfg: DictConfig, scene: Scene) -> tuple[Any, dict[str, Any]]:
     predictor = {"base": "linear", **given}
     with error_in("model"):
         inputs = models.Inputs.from_scene(scene, **predictor)
-    more = {"inputs": inputs} if "inputs" in validation.options_of(node) else {}
+    more = {"inputs": inputs} if "inputs" in validation.options_of("model", node)[0] else {}
     return instantiate(OmegaConf.create({"model": node}), "model", scene=scene, **more), predictor
 
 
 def build_trainer(cfg: DictConfig) -> "L.Trainer":
-    """Return the trainer of a configuration with its callbacks and loggers.
-
-    Raises a `ConfigError` if the machine, the options and the callbacks do not fit together.
-    """
+    """Return the trainer of a configuration with its callbacks and loggers."""
     from lightning.fabric.utilities.exceptions import MisconfigurationException
 
     require_keys(cfg, "trainer")
     callbacks, loggers = (list(_parts(cfg, key).values()) for key in ("callbacks", "logger"))
     more: dict[str, Any] = {"callbacks": callbacks, "logger": loggers or False}
-    if (limit := cfg.trainer.get("max_time")) is not None:
-        more["max_time"] = _time_limit(limit)
+    limit = cfg.trainer.get("max_time")
+    if isinstance(limit, str) and limit.count(":") == 2:  # Lightning knows DD:HH:MM:SS alone
+        more["max_time"] = f"00:{limit}"
     with error_in("trainer", MisconfigurationException):
         return typing.cast("L.Trainer", instantiate(cfg, "trainer", **more))
-
-
-def _time_limit(limit: str | DictConfig) -> datetime.timedelta:
-    """Return the time HH:MM:SS or DD:HH:MM:SS, or the sum of units and numbers."""
-    form = "must be HH:MM:SS, DD:HH:MM:SS or {minutes: NUMBER}, and above 0"
-    units = dict(limit) if isinstance(limit, DictConfig) else {}
-    if isinstance(limit, str) and (found := TIME.fullmatch(limit)):
-        names = ("days", "hours", "minutes", "seconds")
-        units = {name: int(part or 0) for name, part in zip(names, found.groups(), strict=True)}
-    try:
-        time = datetime.timedelta(**units)
-    except (TypeError, OverflowError):
-        time = datetime.timedelta()
-    if time <= datetime.timedelta():
-        raise ConfigError(f"trainer.max_time = {limit} {form}")
-    return time
 
 
 def show_plan(scene: Scene, *parts: Any, folder: str | None = None, verbose: bool = False) -> None:
@@ -307,7 +247,7 @@ def show_plan(scene: Scene, *parts: Any, folder: str | None = None, verbose: boo
         scene: The scene.
         *parts: Further objects whose work is described, such as data and surrogate.
         folder: Folder of the run.
-        verbose: List the computations that are skipped; otherwise they are counted.
+        verbose: List the computations that are skipped instead of counting them.
     """
     described = [pair for part in (scene, *parts) for pair in getattr(part, "describe", list)()]
     if folder is not None:

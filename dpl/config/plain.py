@@ -33,7 +33,9 @@ NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its re
 def error_in(key: str, *kinds: type[Exception]) -> Iterator[None]:
     """Turn a ValueError, or errors of these kinds, into a `ConfigError` that names a key.
 
-    A `ConfigError` and a `DataSetError` remain what they are: their messages name the place.
+    Without a key, the message of the error names it. A `ConfigError` and a `DataSetError` remain
+    what they are: their messages name the place. A message ends after 100 words, since torch lists
+    all weights that do not fit.
     """
     kinds = kinds or (ValueError,)
     try:
@@ -41,21 +43,21 @@ def error_in(key: str, *kinds: type[Exception]) -> Iterator[None]:
     except (ConfigError, DataSetError):
         raise
     except kinds as error:
-        raise ConfigError(f"{key}: {error}") from error
+        reason = " ".join(str(error).split()[:100]) or type(error).__name__
+        raise ConfigError(f"{key}: {reason}" if key else reason) from error
 
 
 def to_container(cfg: DictConfig) -> dict[str, Any]:
     """Return a configuration without interpolations; raise a `ConfigError` for a missing value."""
     try:
-        return typing.cast(
-            "dict[str, Any]", OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
-        )
-    except MissingMandatoryValue as error:
-        raise ConfigError(f"{error.full_key} is missing; set it on the command line") from None
+        found: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        return typing.cast("dict[str, Any]", found)
     except OmegaConfBaseException as error:
         message = str(error.msg or error).splitlines()[0]
+        missing = isinstance(error, MissingMandatoryValue) and error.full_key
         if isinstance(error, InterpolationToMissingValueError):  # another key needs its value
             missing = message.rpartition(": ")[2]
+        if missing:
             raise ConfigError(f"{missing} is missing; set it on the command line") from None
         raise ConfigError(f"{error.full_key or 'config'}: {message}") from None
 
@@ -91,9 +93,8 @@ def check(cfg: DictConfig, *, trust: bool = True, keys: validation.Keys = ()) ->
 
 def require_keys(cfg: DictConfig, *keys: str) -> None:
     """Raise a `ConfigError` if a key does not exist."""
-    for key in keys:
-        if key not in cfg:
-            raise ConfigError(f"{key} is missing")
+    if absent := [key for key in keys if key not in cfg]:
+        raise ConfigError(f"{absent[0]} is missing")
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -117,11 +118,7 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def files_of_run(folder: str | Path) -> tuple[Path, Path]:
-    """Return the configuration and the best weights of a run.
-
-    Raises:
-        ConfigError: One of them does not exist.
-    """
+    """Return the paths of the configuration and of the best weights of a run, which exist."""
     config = Path(folder) / "config.yaml"
     kept = [Path(folder) / "checkpoints" / name for name in LOADABLE]
     best = next((path for path in kept if path.exists()), kept[-1])

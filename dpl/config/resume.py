@@ -1,4 +1,7 @@
-"""Begin or resume a training run: write its configuration, compare it with that of the run."""
+"""Begin or resume a training run: write its configuration, compare it with that of the run.
+
+All functions raise a `ConfigError` where the run cannot be resumed.
+"""
 
 import shutil
 import warnings
@@ -40,9 +43,7 @@ def save_config(cfg: DictConfig, folder: Path, *, without: Collection[str] = ())
     """Write a configuration without interpolations, and copies of its files, to a folder.
 
     The keys `without` are left out. A mesh is written as it was checked; other files are copied
-    byte for byte.
-
-    Raises a `ConfigError` if the folder contains another run that is not resumed.
+    byte for byte. A folder with another run that is not resumed is refused.
     """
     if (folder / "checkpoints" / "last.ckpt").exists() and not cfg.ckpt_path:
         raise ConfigError(
@@ -77,11 +78,8 @@ def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     It is `cfg`, that of the command line, where no run is resumed, and where the command line names
     an option that changes several groups, such as `experiment`: it then has to repeat all of them.
     An option of the group `trainer` changes the machine alone, one of the group `data` nothing if
-    the run has the same kind of data: it lets keys of this kind be given.
-
-    Raises:
-        ConfigError: The configuration of the run cannot be read, or it calls an object outside this
-            package that neither `cfg` calls in the same place nor `trust=true` allows.
+    the run has the same kind of data: it lets keys of this kind be given. The run may call objects
+    outside this package that `cfg` calls in the same place, and any with `trust=true`.
     """
     checkpoint = _resumed(cfg)
     path = None if checkpoint is None else checkpoint.parent.parent / "config.yaml"
@@ -117,17 +115,14 @@ def _kind_of_data(cfg: DictConfig) -> Any:
 
 def with_files_of_resumed(cfg: DictConfig) -> DictConfig:
     """Return a configuration that reads its files from the copies in the run to resume, if any."""
-    checkpoint = _resumed(cfg)
-    return cfg if checkpoint is None else with_copied_files(cfg, checkpoint.parent.parent)[0]
+    path = _resumed(cfg)
+    return cfg if path is None else with_copied_files(cfg, path.parent.parent)[0]
 
 
 def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:
-    """Return the checkpoint to resume; None for a new run.
+    """Return the checkpoint to resume, of a run with the same configuration; None for a new run.
 
     `ckpt_path=last` starts a run that has no checkpoint yet, so that a job has one command line.
-
-    Raises:
-        ConfigError: The checkpoint cannot be resumed, or its run has another configuration.
     """
     from dpl.training import checkpoints
 
@@ -159,15 +154,9 @@ def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:
 def check_weights(
     surrogate: "training.Surrogate", checkpoint: dict[str, Any], *, grows: bool = False
 ) -> None:
-    """Check that the checkpoint to resume is of the same scene and network.
+    """Check that the checkpoint to resume is of the scene and network of an untrained surrogate.
 
-    Args:
-        surrogate: The surrogate, not yet trained.
-        checkpoint: The checkpoint.
-        grows: Whether the data set grows during the training, so that a model is fitted repeatedly.
-
-    Raises:
-        ConfigError: The checkpoint cannot be resumed.
+    A model that is fitted is resumed only where its data set `grows`, so that it is fitted again.
     """
     with error_in("ckpt_path", ValueError, TypeError, AttributeError, RuntimeError):
         surrogate.on_load_checkpoint(checkpoint)
@@ -181,27 +170,18 @@ def check_weights(
 
 
 def check_callbacks(trainer: Any, checkpoint: dict[str, Any]) -> None:
-    """Check that a trainer continues the average of the weights of the checkpoint to resume.
-
-    Raises:
-        ConfigError: The checkpoint contains averaged weights, and the trainer does not average.
-    """
+    """Check that a trainer continues the average of the weights of the checkpoint to resume."""
     averages = any(isinstance(one, training.AveragedWeights) for one in trainer.callbacks)
+    stored = checkpoint.get("callbacks")  # a mapping; another type is refused by Lightning
     name = training.AveragedWeights.__name__
-    states = checkpoint.get("callbacks")
-    stored = states if isinstance(states, dict) else {}  # another type is refused by Lightning
-    if not averages and any(str(key).startswith(name) for key in stored):
+    if not averages and isinstance(stored, dict) and any(str(k).startswith(name) for k in stored):
         raise ConfigError("ckpt_path: the run averages its weights; add callbacks=ema")
 
 
 def _changes(theirs: dict[str, Any], ours: dict[str, Any]) -> list[str]:
     """Return the differences that a resumed run must not have from its configuration, as lines."""
     before, now = (
-        {
-            path: value
-            for path, value in validation.iter_nodes(node)
-            if not isinstance(value, dict | list)
-        }
+        {key: one for key, one in validation.iter_nodes(node) if not isinstance(one, dict | list)}
         for node in (theirs, ours)
     )
     unused = (key for key in OF_GRADIENT_DESCENT if key not in theirs)

@@ -1,4 +1,8 @@
-"""Read the folder of a training run."""
+"""Read the folder of a training run.
+
+All functions raise a `ConfigError` where there is no finished run, its files are damaged, or its
+configuration is invalid or calls an object that is not trusted.
+"""
 
 import contextlib
 import os
@@ -15,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from dpl import data, inference, training
 from dpl.config import validation
 from dpl.config.build import SCENE, build_scene, build_trained, instantiate
-from dpl.config.plain import files_of_run, read_config, require_keys, to_container
+from dpl.config.plain import error_in, files_of_run, read_config, require_keys, to_container
 from dpl.config.validation import ConfigError
 from dpl.scene import Scene
 from dpl.system.memory import at_most
@@ -27,9 +31,6 @@ OF_SCENE = (*SCENE, "fixed", "regions")
 PREDICTION = (*OF_SCENE, "model", "seed")  # keys of a run that `load` reads
 HUB = "hf://"  # begins the names of runs on the Hugging Face Hub
 SHARED = ["config.yaml", "checkpoints/*.safetensors", "*.vtu", "*.npy", "*.npz", "*.safetensors"]
-UNUSABLE = (  # errors of a damaged checkpoint
-    *(OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, ArithmeticError),
-)
 
 
 def with_copied_files(
@@ -44,9 +45,6 @@ def with_copied_files(
 
     Returns:
         The configuration, and the path and the place of the copy of each file, by key.
-
-    Raises:
-        ConfigError: A copy is required and missing.
     """
     found, files = to_container(cfg), {}
     scene = {key: found[key] for key in OF_SCENE if key in found}
@@ -85,15 +83,10 @@ def checked_config(
     trust: bool | Mapping[str, Any] = False,
     keys: Collection[str] | None = None,
 ) -> dict[str, Any]:
-    """Return the configuration of a run whose objects may be called.
+    """Return the configuration of a run whose objects may be called, or these `keys` of it.
 
-    Args:
-        path: Its file.
-        trust: Allow calls of any object, or of those of another configuration, see `check`.
-        keys: Keys to read; None for all.
-
-    Raises:
-        ConfigError: It cannot be read, is invalid, or calls an object that is not trusted.
+    `trust` allows calls of any object, or of those of another configuration, see
+    `dpl.config.validation.check`.
     """
     found = read_config(path)
     found = {key: node for key, node in found.items() if keys is None or key in keys}
@@ -122,9 +115,6 @@ def load_run(
         trust: Import and call objects outside this package, such as your own law, that the
             configuration names.
         keys: Keys of the configuration to read, at least `PREDICTION`; None for all.
-
-    Raises:
-        ConfigError: There is no finished run, or it names an object that is not trusted.
     """
     config, best = files_of_run(folder)
     cfg = OmegaConf.create(checked_config(config, trust=trust, keys=keys))
@@ -134,7 +124,15 @@ def load_run(
         checkpoint = checkpoints.read(best)
         if (points := checkpoint.get(checkpoints.DATA, {}).get("points")) and "data" in cfg:
             cfg.data.train = int(points[-1][0])
-    scene = scene or _scene_of_run(cfg, best, checkpoint, trust=trust)
+        weights = [t for t in checkpoint["state_dict"].values() if torch.is_tensor(t)]
+        # a damaged or hostile file may state any number of nodes
+        nodes = min(sum(t.numel() for t in weights), int(checkpoint.get("nodes", 10**18)))
+    if scene is None:
+        require_keys(cfg, *SCENE)
+        own, _ = with_copied_files(cfg, Path(folder), required=not trust)
+        refused = at_most(nodes, f"{best} is of no larger body")
+        with contextlib.nullcontext() if trust else refused:
+            scene = build_scene(own)
     surrogate = build_trained(cfg, scene)
     with usable(best):
         checkpoints.check_scene(checkpoint, scene)
@@ -143,33 +141,13 @@ def load_run(
     return cfg, surrogate
 
 
-@contextlib.contextmanager
-def usable(checkpoint: str | Path) -> Iterator[None]:
+def usable(checkpoint: str | Path) -> contextlib.AbstractContextManager[None]:
     """Turn the errors of a damaged checkpoint into a `ConfigError` that names it."""
-    try:
-        yield
-    except UNUSABLE as error:
-        reason = " ".join(str(error).split()[:60]) or type(error).__name__
-        raise ConfigError(f"{checkpoint} cannot be used: {reason}") from error
-
-
-def _scene_of_run(
-    cfg: DictConfig, weights: Path, checkpoint: dict[str, Any], *, trust: bool
-) -> Scene:
-    """Return the scene of a run; its files are read from the folder of the run.
-
-    Without `trust` the run needs copies of its files, and its checkpoint bounds the number of
-    nodes: no network has fewer weights than its body has nodes.
-    """
-    require_keys(cfg, *SCENE)
-    own, _ = with_copied_files(cfg, weights.parent.parent, required=not trust)
-    if trust:
-        return build_scene(own)
-    most = sum(t.numel() for t in checkpoint["state_dict"].values() if torch.is_tensor(t))
-    if isinstance(nodes := checkpoint.get("nodes"), int):
-        most = min(nodes, most)
-    with at_most(most, f"{weights} is of no larger body"):
-        return build_scene(own)
+    return error_in(
+        f"{checkpoint} cannot be used",
+        *(OSError, ValueError, TypeError, LookupError),
+        *(AttributeError, RuntimeError, ArithmeticError),
+    )
 
 
 def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":
@@ -182,7 +160,7 @@ def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":
             configuration names.
 
     Raises:
-        ValueError: There is no finished run, its checkpoint belongs to another scene, or it names
+        ConfigError: There is no finished run, its checkpoint belongs to another scene, or it names
             an object that is not trusted.
     """
     with _local(str(folder)) as place:

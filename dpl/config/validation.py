@@ -139,15 +139,12 @@ def check(
             of `TRUSTED_RESULTS`: of `EXPECTED_TYPES` under a key, and of `PARTS` within a call.
             Nothing else is imported.
         keys: Keys of the command besides `KEYS`, in the same form.
-
-    Raises:
-        ConfigError: A key is unknown, a value has the wrong type, is not finite or is out of range,
-            or an object does not exist or is not trusted.
     """
-    known = _by_name((*KEYS, *keys))
+    known = {
+        name: (hint, *limits) for hint, names, *limits in (*KEYS, *keys) for name in names.split()
+    }
     trusted = dict(iter_nodes(trust)) if isinstance(trust, Mapping) else {}
-    if unknown := sorted({str(key) for key in resolved} - set(known)):
-        raise ConfigError(f"{unknown[0]}: there is no such key; {suggestion(unknown[0], known)}")
+    refuse_unknown("", sorted(map(str, resolved)), known)
     for node in (written, resolved):  # `written` first: it names the key that was set
         for path, value in iter_nodes(node):
             if isinstance(value, float) and not math.isfinite(value):
@@ -157,21 +154,38 @@ def check(
     for path, node in iter_nodes(resolved):
         if path in known:
             _check_value(path, node, *known[path])
-            _check_keys(path, node, known)
+            below = {key.rpartition(".")[2] for key in known if key.startswith(f"{path}.")}
+            if below and isinstance(node, dict) and not _names_target(node):
+                refuse_unknown(path, node, below)
         if _names_target(node):
             is_trusted = trust is True or node == trusted.get(path)
             target = _target(path, node["_target_"], None if is_trusted else _kinds(path, resolved))
-            if path == "data":
-                _check_data(node["_target_"], target, resolved)
+            for key, kind in CLASSES_OF_DATA.items() if path == "data" else ():
+                foreign = inspect.isclass(target) and not is_instance_of(target, {kind})
+                if key in resolved and foreign:
+                    must = f"must be dpl.data.{kind.rpartition('.')[2]} or a class derived from it"
+                    raise ConfigError(f"data._target_ = {node['_target_']!r} {must}")
             _check_call(path, node, target)
-        elif _is_call(path, resolved) and not is_instance_of(type(node), _kinds(path, resolved)):
-            if node is None:
-                continue
+        elif node is None or not _is_call(path, resolved):
+            continue
+        elif not is_instance_of(type(node), _kinds(path, resolved)):
             raise ConfigError(f"{path} = {node!r} must be a call: its _target_ is missing")
 
 
-def _by_name(keys: Keys) -> dict[str, tuple[Any, ...]]:
-    return {name: (kind, *limits) for kind, names, *limits in keys for name in names.split()}
+def refuse_unknown(
+    place: str,
+    given: Iterable[Any],
+    known: Collection[str],
+    fault: str = "there is no such key",
+) -> None:
+    """Raise a `ConfigError` for a name that is unknown at a place, with the most similar or all."""
+    above = f"{place}." if place else ""
+    for name in map(str, given):
+        if name not in known:
+            advice = f"there are {', '.join(sorted(known))}"
+            if near := difflib.get_close_matches(name, known, 1):
+                advice = f"did you mean {above}{near[0]}?"
+            raise ConfigError(f"{above}{name}: {fault}; {advice}")
 
 
 def names_several(key: str, node: Any) -> bool:
@@ -192,16 +206,6 @@ def _kinds(path: str, resolved: Mapping[str, Any]) -> set[str]:
     return EXPECTED_TYPES[path.partition(".")[0]] if _is_call(path, resolved) else PARTS
 
 
-def _check_data(name: str, target: Any, resolved: Mapping[str, Any]) -> None:
-    """Check that the class of `data` is the one that the command needs."""
-    for key, kind in CLASSES_OF_DATA.items():
-        if key in resolved and inspect.isclass(target) and not is_instance_of(target, {kind}):
-            raise ConfigError(
-                f"data._target_ = {name!r} must be dpl.data.{kind.rpartition('.')[2]} or a class "
-                "derived from it"
-            )
-
-
 def _check_value(
     key: str, value: Any, hint: Any, least: float = -math.inf, most: float = math.inf
 ) -> None:
@@ -220,16 +224,6 @@ def _check_type(path: str, value: Any, hint: Any) -> None:
     if not matches_type(value, hint):
         call = ", not a call" if _names_target(value) else ""
         raise ConfigError(f"{path} = {value!r} must be {_describe(hint)}{call}")
-
-
-def _check_keys(path: str, node: Any, known: Collection[str]) -> None:
-    """Check the keys of a mapping whose keys are listed in `KEYS`."""
-    names = {key.rpartition(".")[2] for key in known if key.startswith(f"{path}.")}
-    if isinstance(node, dict) and "_target_" not in node and names:
-        for key in map(str, node):
-            if key not in names:
-                message = suggestion(key, names, f"{path}.")
-                raise ConfigError(f"{path}.{key}: there is no such key; {message}")
 
 
 def _target(path: str, name: Any, kinds: set[str] | None = None) -> Callable[..., Any]:
@@ -300,41 +294,27 @@ def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> 
         raise ConfigError(f"{path}._target_ = {node['_target_']!r} has no known options") from None
     if path == "model":
         known, hints = known | set(PREDICTOR), hints | PREDICTOR
-    for key, value in node.items():
-        if key in HYDRA_KEYS:
-            if key.endswith(("partial_", "recursive_")) and not isinstance(value, bool):
-                raise ConfigError(f"{path}.{key} = {value!r} must be true or false")
-            continue
-        if key not in known:
-            message = suggestion(str(key), known, f"{path}.")
-            raise ConfigError(f"{path}.{key}: {node['_target_']} has no such option; {message}")
+    options = {key: value for key, value in node.items() if key not in HYDRA_KEYS}
+    refuse_unknown(path, options, known, f"{node['_target_']} has no such option")
+    for key, value in options.items():
         if key in hints:
             _check_type(f"{path}.{key}", value, hints[key])
 
 
-def options_of(node: Mapping[str, Any]) -> set[str]:
-    """Return the options of a call; none if it is not a call or names nothing that exists."""
-    with contextlib.suppress(ConfigError, TypeError, ValueError):
-        return _signature(_target("", node.get("_target_")))[0]
-    return set()
+def options_of(path: str, node: Mapping[str, Any]) -> tuple[set[str], dict[str, Any]]:
+    """Return the names of the options of a call, and the types of those that have one."""
+    return _signature(_target(path, node.get("_target_")))
 
 
 def options_with_files(node: Any) -> Iterator[tuple[str, dict[str, Any], str]]:
     """Yield key, call and option of each file that a checked node names: options of type `Path`."""
     for path, call in iter_nodes(node):
         if isinstance(call, dict) and "_target_" in call:
-            _, hints = _signature(_target(path, call["_target_"]))
+            hints = options_of(path, call)[1]
             for option, value in call.items():
                 hint = hints.get(option)
                 if isinstance(value, str) and Path in (hint, *typing.get_args(hint)):
                     yield f"{path}.{option}", call, option
-
-
-def suggestion(name: str, known: Collection[str], place: str = "") -> str:
-    """Return an advice for an unknown name: the most similar known name at a place, or all."""
-    if near := difflib.get_close_matches(name, known, 1):
-        return f"did you mean {place}{near[0]}?"
-    return f"there are {', '.join(sorted(known))}"
 
 
 def _signature(target: Callable[..., Any]) -> tuple[set[str], dict[str, Any]]:

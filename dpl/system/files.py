@@ -34,9 +34,7 @@ class DataSetError(ValueError):
 def atomic_write(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
     """Open a temporary file for writing; it replaces `path` when the context ends without error.
 
-    Args:
-        path: Path of the file.
-        sync: Make the file survive a crash of the machine, not only of this process.
+    With `sync`, the file survives a crash of the machine, not only of this process.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -54,11 +52,7 @@ def atomic_write(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
 
 
 def write_file(path: Path, content: bytes, *, sync: bool = True) -> None:
-    """Write a file of a data set atomically, see `atomic_write`.
-
-    Raises:
-        DataSetError: `path` is a folder.
-    """
+    """Write a file of a data set atomically, see `atomic_write`; refuse to replace a folder."""
     try:
         with atomic_write(path, sync=sync) as file:
             file.write(content)
@@ -78,11 +72,7 @@ def sync_folder(path: Path) -> None:
 
 
 def append_jsonl(path: Path, line: dict[str, Any]) -> None:
-    """Append a line of JSON and sync it; an incomplete last line is terminated first.
-
-    Raises:
-        DataSetError: The file is a link, a folder or a device, or larger than `MAX_TEXT_SIZE`.
-    """
+    """Append a line of JSON to a regular file and sync it; terminate an incomplete line first."""
     with suppress(FileNotFoundError):
         _check_regular_file(path, MAX_TEXT_SIZE)
     with path.open("ab+", buffering=0) as file:
@@ -100,12 +90,7 @@ def append_jsonl(path: Path, line: dict[str, Any]) -> None:
 
 
 def read_regular_file(path: Path, most: float = MAX_TEXT_SIZE) -> bytes:
-    """Return the content of a file of a data set.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        DataSetError: It is a link, a folder or a device, or larger than `most` bytes.
-    """
+    """Return the content of a file of a data set, no link, folder or device, of `most` bytes."""
     _check_regular_file(path, most)
     return path.read_bytes()
 
@@ -134,10 +119,6 @@ def read_array(path: Path, row: tuple[int, ...], name: str | None = None) -> NDA
         path: The file.
         row: Shape of a row; -1 for any number.
         name: Name of the array in a .npz file with several.
-
-    Raises:
-        OSError: The file cannot be opened.
-        ValueError: It is not a regular file, is damaged or too large, or contains anything else.
     """
     if path.suffix not in (".npy", ".npz"):
         raise ValueError("the file must be .npy or .npz")
@@ -158,7 +139,7 @@ def read_array(path: Path, row: tuple[int, ...], name: str | None = None) -> NDA
                     which = "one array" if name is None else f"an array {name!r}"
                     raise ValueError(
                         f"the file must contain {which} and has {len(archive.infolist())}: "
-                        f"{', '.join(array_names(archive)) or 'none'}"
+                        f"{', '.join(array_names(path)) or 'none'}"
                     )
                 if members[0].compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                     raise ValueError("the file must be written by numpy.savez")
@@ -170,15 +151,11 @@ def read_array(path: Path, row: tuple[int, ...], name: str | None = None) -> NDA
             raise ValueError(f"the file is damaged: {' '.join(str(error).split())}") from error
 
 
-def array_names(file: Path | zipfile.ZipFile) -> list[str]:
+def array_names(path: Path) -> list[str]:
     """Return the names of the arrays in a .npz file; none if it is no archive."""
-    if isinstance(file, zipfile.ZipFile):
-        return [name.removesuffix(".npy") for name in file.namelist()]
-    try:
-        with zipfile.ZipFile(file) as archive:
-            return array_names(archive)
-    except zipfile.BadZipFile:
-        return []
+    with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+        return [name.removesuffix(".npy") for name in archive.namelist()]
+    return []
 
 
 def _read_npy(file: IO[bytes], size: int, row: tuple[int, ...]) -> NDArray[np.float64]:
@@ -201,20 +178,15 @@ def _read_npy(file: IO[bytes], size: int, row: tuple[int, ...]) -> NDArray[np.fl
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
-    """Return the JSON objects in the lines of a file, without other lines.
+    """Return the JSON objects in the lines of a regular file, without other lines.
 
     A file that does not exist has no lines.
-
-    Raises:
-        DataSetError: It is not a regular file, see `read_regular_file`.
     """
-    content = b""
-    with suppress(FileNotFoundError):
-        content = read_regular_file(path)
     found = []
-    for line in content.splitlines():
-        with suppress(ValueError, RecursionError):
-            found.append(json.loads(line))
+    with suppress(FileNotFoundError):
+        for line in read_regular_file(path).splitlines():
+            with suppress(ValueError, RecursionError):
+                found.append(json.loads(line))
     return [value for value in found if isinstance(value, dict)]
 
 
@@ -223,10 +195,8 @@ def exclusive_lock(folder: Path, shard: int = 0, shards: int = 1) -> Iterator[No
     """Hold the lock of writer `shard` of `shards` writers of a folder.
 
     Writers of the same number `shards` and different `shard` do not exclude each other. The kernel
-    keeps the locks (flock), so that none outlives its process.
-
-    Raises:
-        DataSetError: Another process holds a lock that excludes this one; the message names it.
+    keeps the locks (flock), so that none outlives its process. A `DataSetError` names the process
+    that holds a lock which excludes this one.
     """
     with ExitStack() as stack:
         with (folder / ".writers").open("a") as gate:

@@ -12,9 +12,6 @@ def public_names(package: str) -> tuple[list[str], Callable[[str], object], Call
 
     The names are those that the package's `__init__.py` imports under `if TYPE_CHECKING:`, so that
     type checkers and editors read the same list.
-
-    Args:
-        package: Its `__name__`.
     """
     file = sys.modules[package].__file__
     assert file is not None

@@ -10,13 +10,9 @@ _MOST: ContextVar[tuple[int, str] | None] = ContextVar("most nodes of a mesh", d
 
 
 def refuse_beyond(needed: float, limit: float | None, what: str, remedy: str) -> None:
-    """Raise MemoryError if the required memory exceeds a limit.
+    """Raise MemoryError if objects need more memory [GB] than a limit.
 
-    Args:
-        needed: Required memory [GB].
-        limit: Available memory [GB]; None: that of the GPU, or of the machine if it has no GPU.
-        what: Objects that require the memory, a plural noun.
-        remedy: Advice for the user.
+    The limit None is the memory of the GPU, or of the machine if it has no GPU.
     """
     if limit is None:
         import torch  # not needed by those who read meshes
@@ -42,11 +38,7 @@ def at_most(nodes: int, reason: str) -> Iterator[None]:
 
 
 def refuse_mesh(nodes: int, key: str) -> None:
-    """Raise MemoryError if the stiffness matrix of a mesh with this many nodes exceeds the memory.
-
-    Raises:
-        ValueError: There are more nodes than `at_most` allows.
-    """
+    """Raise an error if K(0) of a mesh exceeds the memory, or its nodes those of `at_most`."""
     most, reason = _MOST.get() or (nodes, "")
     if nodes > most:
         raise ValueError(f"{key} = {_count(nodes)} nodes must be {_count(most)} at most; {reason}")

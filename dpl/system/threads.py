@@ -5,11 +5,17 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache
+from pathlib import Path
 from typing import TypeVar
 
 import torch
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import ThreadpoolController, threadpool_info
 
+# OpenBLAS kernels by flag of the CPU, best first
+KERNELS = {"avx512dq": "SkylakeX", "avx2": "Haswell"}
+CPUINFO = Path("/proc/cpuinfo")
+# kernels that OpenBLAS selects for CPUs that it does not know
+OLD_KERNELS = {"generic", "prescott", "core2", "penryn", "dunnington", "atom", "nehalem"}
 S = TypeVar("S")
 T = TypeVar("T")
 
@@ -69,3 +75,20 @@ def on_threads(call: Callable[[S], T], items: Sequence[S]) -> list[T]:
         return [call(item) for item in items]
     with ThreadPoolExecutor(count) as pool:
         return list(pool.map(call, items))
+
+
+def slow_blas() -> str | None:
+    """Return a line of advice if OpenBLAS does not recognise this CPU, else None."""
+    if "OPENBLAS_CORETYPE" in os.environ or not CPUINFO.exists():
+        return None
+    lines = CPUINFO.read_text().splitlines()
+    flags = next((line.split() for line in lines if line.startswith("flags")), [])
+    best = next((kernels for flag, kernels in KERNELS.items() if flag in flags), None)
+    for library in threadpool_info():
+        kernels = str(library.get("architecture", ""))
+        if library["internal_api"] == "openblas" and best and kernels.lower() in OLD_KERNELS:
+            return (
+                f"OpenBLAS runs its {kernels} kernels on a CPU with newer instructions: "
+                f"set OPENBLAS_CORETYPE={best} before Python starts"
+            )
+    return None

@@ -74,7 +74,7 @@ def test_sigterm_ends_a_growing_training_with_143_and_the_command_that_resumes_i
     assert weights["DataModule"]["points"][0][0] == 64
 
 
-def test_the_set_of_a_growing_run_serves_a_run_of_given_size(train, tmp_path):
+def test_the_set_of_a_growing_run_serves_runs_of_other_sizes(train, tmp_path):
     assert not train(*RUN, *MODEL, *SIZES, *SMALL).status
     again = train("model=unrolled", "data.train=20", "run=other", "logger=none", *MODEL, *SIZES)
     assert not again.status, again.err
@@ -84,10 +84,6 @@ def test_the_set_of_a_growing_run_serves_a_run_of_given_size(train, tmp_path):
         for run in ("run", "other")
     ]
     assert all(weights[0][name].equal(weights[1][name]) for name in weights[0])
-
-
-def test_the_number_of_loads_of_a_run_is_not_that_of_its_data_set(train, tmp_path):
-    assert not train(*RUN, *MODEL, *SIZES, *SMALL).status
     cfg, surrogate = run_folder.load_run(tmp_path / "run")
     more = OmegaConf.merge(cfg, {"data": {"train": 24}})
     assert len(run_folder.load_data(more, surrogate.scene).samples("train").force) == 24
@@ -95,24 +91,20 @@ def test_the_number_of_loads_of_a_run_is_not_that_of_its_data_set(train, tmp_pat
     assert len(run_folder.load_data(cfg, surrogate.scene).snapshots().force) == 20
 
 
-def test_models_trained_by_gradient_descent_are_refused(train):
-    refused = train("model=fcnn", "data=growing")
-    assert refused.status == 2
-    assert refused.err.startswith("error: data=growing needs a model that is fitted")
-    assert refused.err.count("\n") == 1
-
-
 @pytest.mark.parametrize(
-    ("option", "message"),
+    ("line", "message"),
     [
+        ("model=fcnn", "error: data=growing needs a model that is fitted"),
         ("data.train=auto", "data.train = 'auto' must be a whole number or a call that returns a"),
         ("data.train.error=0", "data: error = 0 must be above 0"),
         ("data.train.minutes=-1", "data: minutes = -1 must be above 0 [min], or null"),
         ("data.train.max_train=0", "data: max_train = 0 must lie between 1 and 10,000,000"),
     ],
 )
-def test_values_are_refused_in_one_line_before_any_solve(train, tmp_path, option, message):
-    refused = train("model=unrolled", "data=growing", "data.folder=data", option)
+def test_values_are_refused_in_one_line_before_any_solve(train, tmp_path, line, message):
+    """The default model, unrolled, is fitted."""
+    refused = train("data=growing", "data.folder=data", line)
     assert refused.status == 2
     assert message in refused.err
+    assert refused.err.count("\n") == 1
     assert not (tmp_path / "data").exists()

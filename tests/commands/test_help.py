@@ -64,9 +64,6 @@ def test_help_follows_the_options_of_the_command_line(script, tmp_path):
     assert "  blades: 5" in ended.out
     assert "beam, file, finger, paper_beam, propeller*, rectangle" in " ".join(ended.out.split())
     assert "circle of the tips [m]" in ended.out, "the comment of a key"
-
-
-def test_help_of_a_wrong_option_ends_with_one_line(script, tmp_path):
     ended = script("train", "--help", "modle=3", cwd=tmp_path)
     assert ended.status == 2
     assert ended.err == "error: modle: there is no such key; did you mean model?\n"

@@ -13,23 +13,19 @@ import dpl
 from dpl.config import ConfigError, plain, resume, run_folder, validation
 
 STORED = {  # options of train.py
-    "default": [],
-    "linear pod": ["model=pod", "callbacks=ema", "logger=wandb"],
     "stream of mixed loads": [
-        *("loads=mixture", "data=online", "model=gnn", "loss=blended", "optimizer=muon"),
-        *("callbacks=early_stopping", "logger=csv", "trainer=ddp"),
+        *("mesh=propeller", "loads=mixture", "data=online", "model=gnn", "loss=blended"),
+        *("optimizer=muon", "callbacks=early_stopping", "logger=csv", "trainer=ddp"),
     ],
     "inclusion": [
         *("experiment=inclusion", "scheduler=null", "callbacks=none", "model=cnn"),
         "young={low:1e6,high:1e9}",
     ],
     "fibres": [
-        "experiment=fibre_beam",
-        "loads=point",
-        "loads.region={_target_:dpl.fem.Tag,name:a}",
+        *("experiment=fibre_beam", "loads=point", "loads.region={_target_:dpl.fem.Tag,name:a}"),
+        *("model=pod", "callbacks=ema", "logger=wandb"),
     ],
-    "finger": ["experiment=finger"],
-    "growing": ["mesh=propeller", "data=growing", "model=unrolled"],
+    "growing": ["experiment=finger", "data=growing", "model=unrolled"],
 }
 FOREIGN = "somebody_elses.record"
 CALLS = [  # each calls or imports a module outside the package
@@ -113,11 +109,7 @@ HARMFUL = [  # calls that would do harm
     {"_target_": "dpl.config.validation.importlib", "name": "antigravity"},
     {"_target_": "dpl.scene.replace", "func": "os.system"},
     {"_target_": "dpl.system.files.atomic_write", "path": "harm"},
-    {
-        "_target_": "dpl.fem.write_mesh",
-        "mesh": {"_target_": "dpl.fem.box"},
-        "path": "harm.vtk",
-    },
+    {"_target_": "dpl.fem.write_mesh", "mesh": {"_target_": "dpl.fem.box"}, "path": "harm.vtk"},
     {"_target_": "benchmarks.peers.time_reference_code", "python": "touch", "program": "harm"},
     {
         "_target_": "lightning.pytorch.cli.instantiate_class",
@@ -242,15 +234,8 @@ def test_the_command_line_may_name_any_object_where_one_is_expected(key, compose
 @pytest.mark.parametrize(
     "key",
     [
-        *("trainer.max_epochs", "trainer.precision", "mesh.size", "mesh.size.1", "tags"),
-        *(
-            "seed",
-            "ckpt_path",
-            "paths.runs",
-            "extras.view",
-            "young",
-            "callbacks.training_time.folder",
-        ),
+        *("trainer.max_epochs", "trainer.precision", "mesh.size", "mesh.size.1", "tags", "seed"),
+        *("ckpt_path", "paths.runs", "extras.view", "young", "callbacks.training_time.folder"),
     ],
 )
 def test_a_call_is_refused_where_a_value_is_expected(stored, key):

@@ -25,7 +25,7 @@ from dpl.fem.linear import (
 )
 from dpl.fem.linear.banded import BandedFactor, MixedPrecisionFactor
 from dpl.fem.linear.ordering import band_storage
-from dpl.system.blas import slow_blas
+from dpl.system.threads import slow_blas
 
 KNOWN = ["band", "band32", "pardiso", "superlu", "cg"]
 DIRECT = ["band", "band32", "pardiso", "superlu"]  # those that solve indefinite matrices too
@@ -592,9 +592,9 @@ def test_slow_kernels_on_a_fast_cpu_are_reported(monkeypatch, tmp_path, flags, k
     (tmp_path / "cpuinfo").write_text(f"processor : 0\nflags : {flags}\n")
     library = {"internal_api": "openblas", "architecture": kernels}
     monkeypatch.delenv("OPENBLAS_CORETYPE", raising=False)
-    monkeypatch.setattr("dpl.system.blas.CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr("dpl.system.threads.CPUINFO", tmp_path / "cpuinfo")
     monkeypatch.setattr(
-        "dpl.system.blas.threadpool_info", lambda: [{"internal_api": "mkl"}, library]
+        "dpl.system.threads.threadpool_info", lambda: [{"internal_api": "mkl"}, library]
     )
     said = slow_blas()
     assert said is None if advice is None else advice in said

@@ -80,23 +80,17 @@ def test_a_worker_that_is_still_importing_ends_with_its_parent(launched, moment)
     assert "at work" not in out
 
 
-@pytest.mark.timeout(3 * LONG)
-def test_a_worker_returns_its_exit_status_to_its_parent(launched):
-    text = PROGRAM.format(then="worker.join(); print(worker.exitcode, worker.pid != os.getpid())")
-    waits = '    print("importing", flush=True)\n    threading.Event().wait()'
-    text = text.replace(waits, "    pass")
-    out, _ = launched(text).communicate(timeout=LONG)
-    assert out == "at work\n0 True\n"
-
-
-def test_the_start_of_other_processes_is_unchanged():
+def test_a_worker_returns_its_exit_status_and_leaves_other_starts_unchanged():
     from multiprocessing import spawn
 
     before = spawn.get_command_line
     context = spawn_context()
-    worker = context.Process(target=os.getpid)
-    worker.start()
-    worker.join()
-    assert worker.exitcode == 0
+    workers = [context.Process(target=target) for target in (os.getpid, os.abort)]
+    for worker in workers:
+        worker.start()
+    assert {worker.pid for worker in workers}.isdisjoint({os.getpid()})
+    for worker in workers:
+        worker.join()
+    assert [worker.exitcode for worker in workers] == [0, -signal.SIGABRT]
     assert spawn.get_command_line is before
     assert context.get_start_method() == "spawn"
