@@ -16,28 +16,55 @@ PROGRAM = textwrap.dedent(
     import contextlib, io, runpy, sys
     from hydra.core.global_hydra import GlobalHydra
 
-    for script in sys.argv[1:]:
+    folder, commands, tiny = (word.split() for word in sys.argv[1:])
+
+    def call(name, *arguments):
+        sys.argv = [name, *arguments]
+        GlobalHydra.instance().clear()
+        try:
+            runpy.run_path(f"{folder[0]}/{name}.py", run_name="__main__")
+        except SystemExit as end:
+            return end.code
+        return 0
+
+    for name in commands:
         for flags in (["--help"], ["--cfg", "job"]):
-            sys.argv = [script, *flags]
-            GlobalHydra.instance().clear()
             reported = io.StringIO()
-            with contextlib.redirect_stdout(reported), contextlib.suppress(SystemExit):
-                runpy.run_path(script, run_name="__main__")
-            assert reported.getvalue().strip(), (script, flags)
-            heavy = {"torch", "lightning", "numba", "skfem", "scipy"} & set(sys.modules)
-            assert not heavy, (script, flags, heavy)
+            with contextlib.redirect_stdout(reported):
+                assert not call(name, *flags)
+            assert reported.getvalue().strip(), (name, flags)
+    for line in ("evaluate run=no", "view run=no", "export run=no", "compare run=no",
+                 "train model=fcnn model.widht=3"):
+        assert call(*line.split()) == 2, line
+    heavy = {"torch", "lightning", "numba", "skfem", "scipy"} & set(sys.modules)
+    assert not heavy, heavy
+    call("generate", "data.train=3", "data.val=1", "data.test=1", "data.workers=0", *tiny)
+    heavy = {"lightning", "torchmetrics", "matplotlib", "tensorboard", "pytorch_lightning"}
+    assert "torch" in sys.modules
+    assert not heavy & set(sys.modules), heavy & set(sys.modules)
+    from dpl.config import load_run
+    from dpl.inference import Simulator
+    assert "lightning" not in sys.modules
     """
 )
 
 
-def test_help_and_the_configuration_of_installed_commands_import_no_torch(environment, tmp_path):
-    paths = [str(ROOT / "scripts" / f"{name}.py") for name in INSTALLED]
-    command = [sys.executable, "-c", PROGRAM, *paths]
+def test_help_and_errors_need_no_torch_and_generated_loads_and_loaded_runs_no_lightning(
+    environment, tmp_path, tiny
+):
+    words = str(ROOT / "scripts"), " ".join(INSTALLED), " ".join(tiny)
     ended = subprocess.run(
-        command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False
+        [sys.executable, "-c", PROGRAM, *words],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert ended.returncode == 0, ended.stderr[-2000:]
-    assert not list(tmp_path.iterdir())
+    assert "train: 3 of 3 loads accepted" in ended.stdout
+    assert [line.partition(":")[0] for line in ended.stderr.splitlines()] == ["error"] * 5
+    assert [path.name for path in tmp_path.iterdir()] == ["datasets"]
 
 
 def test_help_ends_quietly_where_the_reader_of_its_output_has_ended(environment, tmp_path):

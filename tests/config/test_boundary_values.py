@@ -192,8 +192,9 @@ def test_values_of_a_body_without_a_modulus_are_values_over_it(make_scene):
     assert Units(4.0).displacement(0.2) == 0.05
 
 
-def test_a_follower_pressure_in_pascals_shortens_a_bar_as_a_dead_load_at_first(scene_of):
-    scene = scene_of(*BAR, INFLATE)
+@pytest.mark.parametrize("force", [INFLATE, MUSCLE])
+def test_a_follower_load_in_pascals_shortens_a_bar_by_its_ratio_to_the_modulus(scene_of, force):
+    scene = scene_of(*BAR, force)
     assert scene.loads.constant_force is None
     x, u = metres(scene)
     assert u[:, 0] == pytest.approx(-45.0 / E * x, rel=1e-12, abs=1e-12)
@@ -215,13 +216,6 @@ def test_a_range_of_pressures_has_the_name_of_the_force_and_is_in_pascals(scene_
     doubled = scene_of(*BAR, INFLATE.replace("45.0", "[0.0, 90.0]"), "young=9e3")
     assert doubled.fingerprint != scene.fingerprint  # its samples have other parameters
     assert "inflate from 0 to 45 Pa" in dict(scene.describe())["supports"]
-
-
-def test_an_active_stress_in_pascals_shortens_a_bar_by_its_ratio_to_the_modulus_at_first(scene_of):
-    scene = scene_of(*BAR, MUSCLE)
-    assert scene.loads.constant_force is None
-    x, u = metres(scene)
-    assert u[:, 0] == pytest.approx(-45.0 / E * x, rel=1e-12, abs=1e-12)
 
 
 def test_an_active_stress_has_the_name_of_the_force_and_the_directions_of_the_law(scene_of):

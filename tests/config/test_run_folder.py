@@ -3,9 +3,6 @@
 import importlib.util
 import re
 import shutil
-import subprocess
-import sys
-import textwrap
 from itertools import pairwise
 from pathlib import Path
 
@@ -35,7 +32,6 @@ BAD = {  # override -> what the message must name
     "solver._partial_=false": r"solver: .*missing .*'problem'; set _partial_: true if the caller",
     "young=-1": r"young = -1",
     "young=1e308": r"young = 1e\+308 must lie between 1e-30 and 1e\+30",
-    "young=[2e9,1e9]": r"young = \[2000000000\.0, 1000000000\.0\]",
     "young={low:1e6,hihg:1e9}": r"young\.hihg: there is no such key; did you mean young\.high\?",
     "young={low:1e9,high:1e6}": r"young = .* an ascending range",
     "young={low:0,high:1e6}": r"young\.low = 0 must lie between",
@@ -44,27 +40,18 @@ BAD = {  # override -> what the message must name
     "mesh.nodes=[5,3]": r"mesh: nodes = \[5, 3\]",
     "mesh.nodes=[5,3,2.5]": r"mesh\.nodes = \[5, 3, 2\.5\] must be a list, each a whole number",
     "mesh.size=[1,1,nan]": r"mesh\.size\.2 = nan",
-    "+mesh.cell=pyramid": r"mesh: cell = 'pyramid'",
     "mesh=file": r"mesh\.path",
     "mesh=file mesh.path=nowhere.msh": r"mesh: nowhere\.msh: no such mesh file",
     "mesh=file mesh.path=12": r"mesh\.path = 12 must be",
     "fixed.at=7": r"fixed.*Plane\(axis=0, at=7\) holds no node",
     "loads=traction loads.region=7": r"loads.region = 7 must be a call or .* or a text or null$",
-    "fixed.axis=3": r"fixed: axis = 3",
     "fixed.at=middle": r"fixed: at = 'middle'",
     "fixed.at=null": r"fixed\.at = None must be a number or a text",
     "degree=3": r"degree",
     "solver.tol=0": r"solver: tol = 0",
     "+solver.max_iter=0": r"solver: max_iter = 0",
-    "solver.linear=umfpack": r"umfpack",
     "loads.n_modes=0": r"loads: n_modes = 0",
-    "loads.n_modes=1000": r"n_modes = 1000",
-    "loads.modes=[3,0]": r"loads: modes = \[3, 0\] must be ascending",
-    "loads.modes=[1000]": r"loads: modes = \[1000\] must lie between 0 and",
-    "loads.deflection=-0.1": r"loads: deflection = -0\.1",
-    "loads.patch_radius=[0.5,0.1]": r"loads: patch_radius = \[0\.5, 0\.1\]",
     "loads.distribution._target_=dpl.fem.materials.tensors.hooke": r"loads\.distribution\._target_",
-    "loads.deflection=1e-300": r"loads: deflection = 1e-300",
     "loads.n_modes=1000000000000000000000": r"loads\.n_modes = 10+ does not fit into 64 bits",
     "loads.distribution=uniform": r"loads\.distribution = 'uniform' must be",
     "~mesh": r"mesh is missing",
@@ -104,21 +91,16 @@ def test_what_cannot_work_is_refused_by_its_key(compose, override, tmp_path):
 
 
 BAD_TRAINING = {
-    "data.batch_size=0": r"data: batch_size = 0",
     "data.train=0": r"data\.train = 0 must lie between 1 and",
     "+data.vall=3": r"data\.vall: .* has no such option",
-    "model.layers=1": r"model: layers = 1",
     "model.width=wide": r"model\.width = 'wide' must be a whole number or null",
     "+model.memory_limit=1e-6": r"model: .* parameters .* need .* GB, there are 0\.0 GB",
-    "loss=lr_plus loss.weight=-1": r"loss: weight = -1",
     "optimizer.lr=fast": r"optimizer\.lr = 'fast'",
     "+trainer.epochs=10": r"trainer\.epochs: .* has no such option",
     "callbacks.worst_cases._target_=dpl.training.MSE": r"callbacks\.worst_cases\.every: .* no such",
     "+callbacks.mine={_target_: dpl.fem.NeoHookeanLn, poisson: 0}": r"callbacks\.mine gives .* Neo",
     "+callbacks.mine=3": r"callbacks\.mine = 3 must be a call",
     "seed=abc": r"(seed|shuffle_seed) = 'abc'",
-    "data=online data.train.new_per_round=0": r"data: new_per_round = 0",
-    "data=online data.train.capacity=2": r"data: capacity = 2 must be at least new_per_round = 8",
     "data.timeout=0": r"data: timeout = 0",
     "data=online data.train.capacity=1000000000000": r"data: 10+ samples need .* GB, there",
     "data.batch_size=10000000000": r"data: batch_size = 10+ must lie between 1 and",
@@ -217,7 +199,6 @@ for made in ("dpl.training.LrStar", "skfem.MeshHex", "dpl.fem.propeller"):
 def test_a_body_that_cannot_be_used_is_refused_where_it_is_built(compose, tiny, name):
     overrides, key, node, message = UNUSABLE[name]
     cfg = compose(*tiny, *overrides)
-    cfg = OmegaConf.merge(compose(*tiny, *overrides))
     OmegaConf.set_struct(cfg, False)
     cfg[key] = node
     plain.check(cfg)
@@ -248,51 +229,6 @@ def test_an_interrupt_ends_a_command_with_130_and_a_fault_of_ours_keeps_its_trac
     assert capsys.readouterr().err == "interrupted\n"
     with pytest.raises(ZeroDivisionError), cli.readable_errors():
         raise ZeroDivisionError
-
-
-EARLY = textwrap.dedent(
-    """
-    import runpy, sys
-    folder, *tiny = sys.argv[1:]
-
-    def call(line, *more):
-        name, *arguments = line.split()
-        sys.argv = [name, *arguments, *more]
-        try:
-            runpy.run_path(f"{folder}/{name}.py", run_name="__main__")
-        except SystemExit as end:
-            print(end.code, "torch" in sys.modules)
-
-    for line in ("evaluate run=no", "view run=no", "export run=no", "compare run=no",
-                 "train model=fcnn model.widht=3"):
-        call(line)
-    call("generate data.train=3 data.val=1 data.test=1 data.workers=0", *tiny)
-    heavy = {"lightning", "torchmetrics", "matplotlib", "tensorboard", "pytorch_lightning"}
-    print(sorted(heavy & set(sys.modules)), "torch" in sys.modules)
-    from dpl.config import load_run
-    from dpl.inference import Simulator
-    print("lightning" in sys.modules)
-    """
-)
-
-
-def test_errors_are_found_without_torch_and_runs_are_loaded_without_lightning(
-    tmp_path, environment, tiny
-):
-    """Loads are generated without it, too."""
-    ended = subprocess.run(
-        [sys.executable, "-c", EARLY, str(ROOT / "scripts"), *tiny],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    first, last = (ended.stdout.splitlines()[k] for k in (slice(5), slice(-2, None)))
-    assert first == ["2 False"] * 5
-    assert "train: 3 of 3 loads accepted" in ended.stdout
-    assert last == ["[] True", "False"]
-    assert [line.partition(":")[0] for line in ended.stderr.splitlines()] == ["error"] * 5
 
 
 @pytest.mark.skipif(
