@@ -207,12 +207,21 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
     Refuses a learning-rate schedule over an unlimited training, callbacks that write no weights,
     and a sweep whose training starts processes that would run the sweep again.
     """
+    import torch
     from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
     from dpl.training import writes_loadable
 
     if cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
-        _check_schedule_in_time(cfg)
+        trial = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+        schedule = config.instantiate(cfg, "scheduler", optimizer=trial, total_steps=1)
+        limited = cfg.trainer.get("max_time") is not None
+        if not limited or not isinstance(schedule, torch.optim.lr_scheduler.LambdaLR):
+            why = f", and {type(schedule).__name__} does not follow trainer.max_time" * limited
+            raise ConfigError(
+                f"trainer.max_epochs = -1: the schedule of the learning rate needs an end{why}; "
+                "set trainer.max_epochs or trainer.max_steps, or scheduler=null"
+            )
     if not trainer.fast_dev_run and not any(
         writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks
     ):
@@ -231,23 +240,6 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
             "again; set trainer.strategy=ddp_spawn, or start each run by torchrun or on a cluster "
             "(hydra/launcher=submitit_slurm)"
         )
-
-
-def _check_schedule_in_time(cfg: DictConfig) -> None:
-    """Raise a `ConfigError` unless a time limit is the end of the learning-rate schedule."""
-    import torch
-
-    reason = "the schedule of the learning rate needs an end"
-    if cfg.trainer.get("max_time") is not None:
-        trial = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
-        schedule = config.instantiate(cfg, "scheduler", optimizer=trial, total_steps=1)
-        if isinstance(schedule, torch.optim.lr_scheduler.LambdaLR):
-            return
-        reason += f", and {type(schedule).__name__} does not follow trainer.max_time"
-    raise ConfigError(
-        f"trainer.max_epochs = -1: {reason}; set trainer.max_epochs or trainer.max_steps, or "
-        "scheduler=null"
-    )
 
 
 def best_error(trainer: Any) -> float | None:

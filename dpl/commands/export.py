@@ -12,7 +12,6 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-import dpl
 from dpl import config, export, training
 from dpl.commands.cli import command
 from dpl.evaluation import tables
@@ -25,9 +24,6 @@ RESULT_STREAM = (0, 12)  # random stream of the loads in results
 @command("export")
 def main(cfg: DictConfig) -> None:
     """Write the parts that `outputs` names."""
-    if not cfg.outputs:
-        known = "model, results, runtime, dataset, publish"
-        raise config.ConfigError(f"outputs = [] must contain one of {known}")
     if "results" in cfg.outputs and cfg.count < 1:
         raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or use outputs=[model]")
     config.files_of_run(cfg.run)  # refuses a missing run before torch is imported
@@ -54,19 +50,14 @@ def main(cfg: DictConfig) -> None:
         print(f"for other programs: {path}, {path.stat().st_size / 1e6:.3g} MB")
     if "publish" in cfg.outputs:
         with config.error_in("outputs: publish"):
-            path = publish(cfg, run, surrogate.scene, folder / "published")
+            every = config.to_container(run)
+            kept = {key: every[key] for key in config.PREDICTION if key in every}
+            _, files = config.with_copied_files(run, Path(cfg.run), required=True)
+            path = export.write_published(
+                surrogate.scene, folder / "published", config=kept, run=Path(cfg.run),
+                files=[own for _, own in files.values()], license=cfg.license,
+            )  # fmt: skip
         print(f"to share: {path.parent}; dpl.load reads this folder, also as hf://OWNER/NAME")
-
-
-def publish(cfg: DictConfig, run: DictConfig, scene: "dpl.Scene", folder: Path) -> Path:
-    """Write what `dpl.load` needs of a run to a folder; return the card."""
-    every = config.to_container(run)
-    kept = {key: every[key] for key in config.PREDICTION if key in every}
-    _, files = config.with_copied_files(run, Path(cfg.run), required=True)
-    copies = [own for _, own in files.values()]
-    return export.write_published(
-        scene, folder, config=kept, files=copies, run=Path(cfg.run), license=cfg.license
-    )
 
 
 def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder: Path) -> None:

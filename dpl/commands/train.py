@@ -10,7 +10,7 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 import dpl
 from dpl import config, data, evaluation, training
@@ -167,22 +167,12 @@ def show_next_commands(folder: Path, *, tensorboard: bool) -> None:
 
 
 def session_overrides() -> list[str]:
-    """Return the overrides, as they are typed, that a resumed run does not read from its folder.
-
-    Options of groups may have been chosen by another option, such as `debug`.
-    """
+    """Return the overrides, as they are typed, that a resumed run does not read from its folder."""
     from dpl.config.resume import OF_THE_SESSION
 
-    job, groups = HydraConfig.get(), OF_THE_SESSION - {"run", "folder", "ckpt_path"}
-    defaults = OmegaConf.load(config.CONF / "train.yaml").defaults
-    usual = dict(pair for one in defaults if isinstance(one, DictConfig) for pair in one.items())
-    chosen = {key: name for key, name in job.runtime.choices.items() if key in groups}
-    found = [f"{key}={name}" for key, name in chosen.items() if name != usual.get(key)]
-    for line in job.overrides.task:
-        key = line.lstrip("+~").partition("=")[0]
-        if key not in chosen and key.partition(".")[0] in groups:
-            found.append(shlex.quote(line))
-    return found
+    groups = OF_THE_SESSION - {"run", "folder", "ckpt_path"}
+    lines = {line: line.lstrip("+~").partition("=")[0] for line in HydraConfig.get().overrides.task}
+    return [shlex.quote(line) for line, key in lines.items() if key.partition(".")[0] in groups]
 
 
 def _from_here(folder: Path) -> str:

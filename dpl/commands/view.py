@@ -18,12 +18,17 @@ from dpl.version import install
 def main(cfg: DictConfig) -> None:
     """Serve the page until Ctrl-C; with `animation` write an animation instead."""
     config.files_of_run(cfg.run)  # refuses a missing run before torch is imported
+    if not cfg.animation:
+        require_viewer()
+        policy = bind(cfg)
+    import torch
+
+    torch.set_num_threads(1)
+    body = viewer.Body(dpl.load(cfg.run, trust=cfg.trust))
     if cfg.animation:
-        write_animation(load_body(cfg), Path(cfg.animation))
-        return
-    require_viewer()
-    policy = bind(cfg)
-    serve(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
+        write_animation(body, Path(cfg.animation))
+    else:
+        serve(body, policy, title=str(cfg.run), folder=Path(cfg.folder))
 
 
 def serve(
@@ -41,14 +46,6 @@ def serve(
             page.refresh()
     finally:
         page.close()
-
-
-def load_body(cfg: DictConfig) -> "viewer.Body":
-    """Return the body of the run."""
-    import torch
-
-    torch.set_num_threads(1)
-    return viewer.Body(dpl.load(cfg.run, trust=cfg.trust))
 
 
 def bind(cfg: DictConfig) -> "viewer.AccessPolicy":

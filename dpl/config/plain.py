@@ -99,7 +99,8 @@ def require_keys(cfg: DictConfig, *keys: str) -> None:
 
 def read_config(path: Path) -> dict[str, Any]:
     """Return the configuration of a run as a dictionary; nothing in it is called or looked up."""
-    try:
+    damaged = ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError
+    with error_in(f"{path} is not the configuration of a run", *damaged):
         if (size := path.stat().st_size) > MAX_BYTES:
             raise ValueError(f"has {size:,} bytes, of {MAX_BYTES:,} at most")
         text = path.read_text()
@@ -111,10 +112,7 @@ def read_config(path: Path) -> dict[str, Any]:
             raise ValueError("is no list of keys and values")
         if any(isinstance(one, str) and "${" in one for _, one in validation.iter_nodes(found)):
             raise ValueError("holds an interpolation, which no saved run does")
-    except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"{path} is not the configuration of a run: {reason}") from error
-    return found
+    return typing.cast("dict[str, Any]", found)
 
 
 def files_of_run(folder: str | Path) -> tuple[Path, Path]:

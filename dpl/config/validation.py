@@ -50,7 +50,7 @@ KEYS: Keys = (  # of all commands
     (object, "trainer.limit_train_batches", 1e-30, 10**9),
 )
 UNLIMITED = {"trainer.max_epochs", "trainer.max_steps"}  # keys for which -1 means no limit
-NOT_EMPTY = {"tols", "threads"}  # lists that must name a value
+NOT_EMPTY = {"tols", "threads", "outputs"}  # lists that must name a value
 REGIONS = {  # a region is a call, or the name of a group of the mesh
     *(f"dpl.fem.mesh.regions.{name}" for name in ("Plane", "Box", "Sphere", "Cylinder", "Tag")),
     "builtins.str",
@@ -212,7 +212,7 @@ def _check_value(
     """Check the type of a value, and the range of a number or of each number of a list."""
     _check_type(key, value, hint)
     if value == [] and key in NOT_EMPTY:
-        raise ConfigError(f"{key} = [] must name one value or more")
+        raise ConfigError(f"{key} = [] must name one value or more: {_describe(hint)}")
     for one in value if isinstance(value, list) else [value]:
         unlimited = key in UNLIMITED and one == -1
         if isinstance(one, int | float) and not least <= one <= most and not unlimited:

@@ -79,7 +79,7 @@ def test_a_graph_with_too_large_a_difference_is_removed(script, trained):
         ),
         (
             ["run=runs/first", "outputs=[]"],
-            "outputs = [] must contain one of model, results, runtime, dataset, publish",
+            "outputs = [] must name one value or more: a list, each one of model, results, runtime",
         ),
         (["run=runs/first", "outputs=[runtime]"], "outputs: runtime: the run must be fitted with"),
         (["run=runs/first", "outputs=[results]", "count=0"], "count = 0 must be 1 or more"),
