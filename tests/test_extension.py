@@ -138,7 +138,6 @@ class Dense:
 """
 
 OPTIONS = {
-    "material/own": "_target_: my_parts.Law\npoisson: 0.3\n",
     "material/ranges": "_target_: my_parts.Law\npoisson: [0.2, 0.3]\nstiffening: [0.0, 2.0]\n",
     "mesh/own": "_target_: my_parts.bar\nlength: 3.0\n",
     "loads/bimodal": "defaults: [modal, _self_]\n"
@@ -151,15 +150,18 @@ OPTIONS = {
     "linear: {_target_: my_parts.Dense, _partial_: true}\n",
 }
 RUNS = {  # runs in which every own part has its turn, and what of them is exported
-    "law, mesh, distribution, loss and solver": (
+    "law with ranges, mesh function, distribution, loss and linear backend": (
         [
-            *("material=own", "mesh=own", "loads=bimodal", "loads.n_modes=2", "loss=own"),
-            *("solver=modified", "loads.deflection=0.01", "model=fcnn", "model.width=4"),
+            *("material=ranges", "mesh=own", "loads=bimodal", "loads.n_modes=2", "loss=own"),
+            *("solver=dense", "model=fcnn", "model.width=4"),
         ],
         "[results]",
     ),
-    "law with ranges, load family, network and linear backend": (
-        ["material=ranges", "loads=tip", "model=own", "solver=dense", "mesh.nodes=[4,2,2]"],
+    "load family, network and solver over decades of moduli": (
+        [
+            *("loads=tip", "model=own", "solver=modified", "mesh.nodes=[4,2,2]"),
+            "young={low:1e6,high:1e10,distribution:log}",
+        ],
         "[model,results]",
     ),
 }
@@ -199,6 +201,9 @@ def test_parts_of_a_user_are_trained_evaluated_viewed_and_exported(script, home,
     few = ["count=1", "solve_reference=false"]
     run("export", "run=runs/a", "trust=true", f"outputs={outputs}", *few)
     assert list((home / "runs/a/export/results").glob("*.vtu"))
+    if "model" in outputs:
+        meta = (home / "runs/a/export/meta.json").read_text()
+        assert '"distribution": "log"' in meta
     view(config.load_run(home / "runs/a", trust=True)[1])
 
 

@@ -1,6 +1,5 @@
 """The commands, end to end: what a user types, and what is there afterwards."""
 
-import itertools
 import json
 import os
 import shutil
@@ -11,13 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
-from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
-from tensorboard.context import RequestContext
-from tensorboard.plugins.base_plugin import TBContext
-from tensorboard.plugins.hparams import api_pb2, get_experiment, list_session_groups
-from tensorboard.plugins.hparams.backend_context import Context
 
 ROWS = [
     *("linear", "prediction", "paper's hybrid to 1e-6", "sim(force, error=1e-3)"),
@@ -28,6 +21,12 @@ ROWS = [
 def finish(process, timeout=240):
     out, err = process.communicate(timeout=timeout)
     return process.returncode, out, err
+
+
+def scalars(folder, tag):
+    """Return the events of a scalar of a run, a list for each file that has it."""
+    files = [EventAccumulator(str(path)).Reload() for path in sorted(folder.glob("events*"))]
+    return [file.Scalars(tag) for file in files if tag in file.Tags()["scalars"]]
 
 
 def waited_for(condition, seconds=90):
@@ -118,12 +117,8 @@ def test_a_run_goes_on_where_it_was_left(trained, script, home):
     ended = script("train", *resume, cwd=home)
     assert ended.status == 0, ended.err
     assert "16 of 16" not in ended.out, "no load is solved again"
-    steps = []
-    for path in sorted((home / "runs/second").glob("events*")):
-        events = EventAccumulator(str(path))
-        events.Reload()
-        if "val/e_mean" in events.Tags()["scalars"]:
-            steps.append([event.step for event in events.Scalars("val/e_mean")])
+    parts = scalars(home / "runs/second", "val/e_mean")
+    steps = [[event.step for event in part] for part in parts]
     assert steps[0][-1] < steps[-1][0], "the second part begins after the first one"
     assert len(steps[0]) + len(steps[-1]) == 4
 
@@ -217,86 +212,27 @@ def test_a_killed_parent_leaves_no_process(streaming, members):
 # ------------------------------------------------------------------ sweeps
 
 
-def configurations(folder):
-    """Return those of the runs below a folder, by the last names of network, loss and optimiser."""
-    seen = {}
-    for path in folder.glob("*/config.yaml"):
-        cfg = OmegaConf.load(path)
-        parts = (cfg.model, cfg.loss, cfg.optimizer)
-        seen[tuple(part._target_.rpartition(".")[2] for part in parts)] = path.parent
-    return seen
-
-
-@pytest.fixture
-def swept(script, tiny_training, tmp_path_factory, ended):
-    """Where a sweep over networks and losses ran, once."""
-    if "sweep" not in ended:
-        home = tmp_path_factory.mktemp("swept")
-        sweep = ["-m", "model=fcnn,pod", "loss=mse,lr_star", "trainer.max_epochs=1", "run=sweep"]
-        done = script("train", *sweep, *tiny_training, cwd=home)
-        assert done.status == 0, done.err[-2000:]
-        ended["sweep"] = home
-    return ended["sweep"]
-
-
-def test_a_sweep_over_networks_gives_each_the_loss_that_is_asked_for_and_a_folder(swept):
-    runs = configurations(swept / "sweep")
-    assert set(runs) == {
-        ("FCNN", "MSE", "AdamW"),
-        ("FCNN", "LrStar", "AdamW"),
-        ("PODNet", "MSE", "AdamW"),
-        ("PODNet", "LrStar", "AdamW"),
-    }
-    pairs = itertools.product(("mse", "lr_star"), ("fcnn", "pod"))
-    names = {f"loss-{loss}_model-{model}" for loss, model in pairs}
-    assert {folder.name for folder in runs.values()} == names, "the keys that are swept, no others"
-    judged = {json.loads((folder / "evaluation.json").read_text())[1]["errors"]["e_mean"]
-              for folder in runs.values()}  # fmt: skip
-    assert len(judged) == 4, "each run is another one"
-    assert len(list((swept / "datasets").iterdir())) == 1, "they share the data set"
-    (journal,) = (swept / "datasets").glob("*/journal.jsonl")
+def test_a_sweep_gives_each_network_the_loss_that_is_asked_for_and_a_folder(
+    script, tiny_training, tmp_path
+):
+    sweep = ["-m", "model=fcnn,pod", "loss=mse", "trainer.max_epochs=1", "run=sweep"]
+    done = script("train", *sweep, *tiny_training, cwd=tmp_path)
+    assert done.status == 0, done.err[-2000:]
+    judged = {}
+    for folder in (path.parent for path in (tmp_path / "sweep").glob("*/config.yaml")):
+        cfg = OmegaConf.load(folder / "config.yaml")
+        errors = json.loads((folder / "evaluation.json").read_text())[1]["errors"]
+        parts = [part._target_.rpartition(".")[2] for part in (cfg.model, cfg.loss, cfg.optimizer)]
+        judged[folder.name] = parts, errors["e_mean"]
+        for name in ("e_mean", "e_max", "SNR_min", "rel_L2_median", "residual"):
+            (logged,) = scalars(folder, f"best/{name}")[-1]
+            assert logged.value == pytest.approx(errors[name], rel=1e-5)
+    assert judged.keys() == {"model-fcnn", "model-pod"}, "the key that is swept, no others"
+    assert judged["model-fcnn"][0] == ["FCNN", "MSE", "AdamW"]
+    assert judged["model-pod"][0] == ["PODNet", "MSE", "AdamW"]
+    assert judged["model-fcnn"][1] != judged["model-pod"][1], "each run is another one"
+    (journal,) = (tmp_path / "datasets").glob("*/journal.jsonl")  # they share the data set
     assert len(journal.read_text().splitlines()) == 1, "which is solved once"
-
-
-def test_the_hparams_tab_shows_the_runs_of_a_sweep_side_by_side(swept):
-    """What TensorBoard's own reader hands to the tab: columns, then a line for each run."""
-    runs = EventMultiplexer()
-    runs.AddRunsFromDirectory(str(swept / "sweep"))
-    runs.Reload()
-    provider = MultiplexerDataProvider(runs, str(swept / "sweep"))
-    backend = Context(TBContext(data_provider=provider))
-    requested = RequestContext(), backend, ""
-    columns = get_experiment.Handler(*requested, api_pb2.GetExperimentRequest()).run()
-    request = api_pb2.ListSessionGroupsRequest(
-        start_index=0,
-        slice_size=10,
-        allowed_statuses=[api_pb2.STATUS_SUCCESS],
-        col_params=[
-            *({"hparam": info.name} for info in columns.hparam_infos),
-            *({"metric": info.name} for info in columns.metric_infos),
-        ],
-    )
-    lines = list_session_groups.Handler(*requested, request).run().session_groups
-
-    names = {info.name for info in columns.hparam_infos}
-    assert {"model", "loss", "optimizer.lr", "model.layers", "model.rank", "young"} <= names
-    assert not [name for name in names if "_" in (name[0], name[-1]) or "callbacks" in name]
-    metrics = {info.name.tag for info in columns.metric_infos}
-    judged = ("e_mean", "e_max", "SNR_min", "rel_L2_median", "residual")
-    assert {f"best/{name}" for name in judged} <= metrics
-
-    assert len(lines) == 4
-    folders = configurations(swept / "sweep")
-    for line in lines:
-        shown = {name: value.string_value for name, value in line.hparams.items()}
-        errors = {value.name.tag: value.value for value in line.metric_values}
-        folder = folders[shown["model"], shown["loss"], shown["optimizer"]]
-        rows = json.loads((folder / "evaluation.json").read_text())
-        for name in judged:
-            assert errors[f"best/{name}"] == pytest.approx(rows[1]["errors"][name], rel=1e-5)
-        assert line.hparams["model.width"].number_value == 16
-        assert ("model.rank" in line.hparams) == (shown["model"] == "PODNet")
-        assert ("model.layers" in line.hparams) == (shown["model"] == "FCNN")
 
 
 @pytest.fixture
@@ -312,21 +248,11 @@ def search(script, tiny_training, tmp_path):
     return search
 
 
-def validated(folder):
-    """Return the validation e_mean of a run of one epoch."""
-    for path in folder.glob("events*"):
-        events = EventAccumulator(str(path))
-        events.Reload()
-        if "val/e_mean" in events.Tags()["scalars"]:
-            return events.Scalars("val/e_mean")[-1].value
-    raise AssertionError(f"{folder} was not validated")
-
-
 def test_a_search_goes_on_after_a_trial_that_diverges_and_keeps_the_best_one(search):
     ended, folder = search("hydra.sweeper.n_trials=4", "optimizer.lr=choice(1e6,1e-2)")
     assert ended.status == 0, ended.err[-2000:]
     found = OmegaConf.load(folder / "optimization_results.yaml")
-    errors = [validated(folder / str(number)) for number in range(4)]
+    errors = [scalars(folder / str(k), "val/e_mean")[-1][-1].value for k in range(4)]
     runs = [OmegaConf.load(folder / str(number) / "config.yaml") for number in range(4)]
     rates = [run.optimizer.lr for run in runs]
     assert set(rates[:-1]) == {1e6, 1e-2}, "both are tried, and something after the first"

@@ -36,7 +36,7 @@ GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.n
 
 
 @pytest.fixture
-def part(tmp_path):
+def part(tmp_path, in_process):
     """A mesh file that this package did not write."""
     mesh = box([2.0, 0.5, 0.5], [7, 3, 3], "tetra")
     path = tmp_path / "part.vtk"
@@ -301,7 +301,7 @@ def test_propeller_is_held_at_its_bore_by_name_or_by_place(scene_of, fixed):
 
 
 @pytest.fixture
-def named_part(tmp_path) -> list[str]:
+def named_part(tmp_path, in_process) -> list[str]:
     """Overrides for a bar of 4 x 1 x 2 mm with named faces and cells, in a file in millimetres."""
     mesh = box([4.0, 1.0, 2.0], [5, 2, 3])
     flat = to_meshio(mesh)
