@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 import dpl
 from dpl import config, data, evaluation, training
 from dpl.commands import cli
+from dpl.config.plain import OF_THE_SESSION
 from dpl.system.files import DataSetError
 
 
@@ -168,8 +169,6 @@ def show_next_commands(folder: Path, *, tensorboard: bool) -> None:
 
 def session_overrides() -> list[str]:
     """Return the overrides, as they are typed, that a resumed run does not read from its folder."""
-    from dpl.config.resume import OF_THE_SESSION
-
     groups = OF_THE_SESSION - {"run", "folder", "ckpt_path"}
     lines = {line: line.lstrip("+~").partition("=")[0] for line in HydraConfig.get().overrides.task}
     return [shlex.quote(line) for line, key in lines.items() if key.partition(".")[0] in groups]

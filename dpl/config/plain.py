@@ -23,10 +23,9 @@ from dpl.config.validation import ConfigError
 from dpl.system.files import LOADABLE, DataSetError
 
 MAX_BYTES = 100_000  # of the configuration of a run
-NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its result
-    *("run", "folder", "ckpt_path", "trust", "data.folder"),
-    *("callbacks", "logger", "paths", "extras", "trainer.plugins"),
-}
+# keys that a resumed run takes from the command line
+OF_THE_SESSION = {"run", "folder", "ckpt_path", "trust", "callbacks", "logger", "paths", "extras"}
+NOT_IDENTITY = OF_THE_SESSION | {"data.folder", "trainer.plugins"}  # keys without effect on results
 
 
 @contextlib.contextmanager

@@ -15,19 +15,13 @@ from omegaconf import DictConfig, OmegaConf
 from dpl import training
 from dpl.config import validation
 from dpl.config.build import instantiate
-from dpl.config.plain import NOT_IDENTITY, error_in, read_config, to_container
-from dpl.config.run_folder import (
-    MESH,
-    checked_config,
-    with_copied_files,
-    with_own_data,
-)
+from dpl.config.plain import NOT_IDENTITY, OF_THE_SESSION, error_in, read_config, to_container
+from dpl.config.run_folder import MESH, checked_config, with_copied_files, with_own_data
 from dpl.config.validation import ConfigError
 from dpl.fem import write_mesh_exactly
 from dpl.system.files import atomic_write
 
 OF_GRADIENT_DESCENT = ("loss", "optimizer", "scheduler", "trainer")  # not stored for fitted models
-OF_THE_SESSION = {"run", "folder", "ckpt_path", "callbacks", "logger", "paths", "extras", "trust"}
 MACHINE = tuple(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy"))
 MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
     *(f"trainer.max_{unit}" for unit in ("epochs", "steps", "time")),
