@@ -101,13 +101,13 @@ def check(
         return None
     with config.error_in("run", OmegaConfBaseException):
         first.hydra.run.dir  # noqa: B018  # raises if `run` is no text
-    different = {}
+    different: dict[str, DictConfig] = {}
     for job in jobs or [first]:
         cfg = OmegaConf.masked_copy(job, [key for key in job if key != "hydra"])
         if "folder" in cfg and OmegaConf.is_interpolation(cfg, "folder"):
             cfg.folder = "."  # the node `hydra` sets it later
         config.check(cfg, keys=keys)
-        node = OmegaConf.to_container(cfg)
+        node: Any = OmegaConf.to_container(cfg)
         different[str({key: node[key] for key in node if key not in SAME})] = cfg
     if jobs is None:
         return first

@@ -89,9 +89,10 @@ def build_scene(cfg: DictConfig) -> Scene:
     """Return the scene of a configuration."""
     require_keys(cfg, *SCENE)
     law, ends = law_and_moduli(cfg)
-    forces, dead = _parts(cfg, "forces"), []
+    forces = _parts(cfg, "forces")
     follower = {name: f for name, f in forces.items() if isinstance(f, FollowerLoad)}
     problem = _problem(cfg, law, ends[0] if ends[0] == ends[1] else None, follower)
+    dead: list[Tensor] = []
     for name, force in forces.items():
         with error_in(f"forces.{name}"):
             dead += [] if name in follower else [force.on(problem)]
