@@ -92,7 +92,7 @@ def build_scene(cfg: DictConfig) -> Scene:
     forces = _parts(cfg, "forces")
     follower = {name: f for name, f in forces.items() if isinstance(f, FollowerLoad)}
     problem = _problem(cfg, law, ends[0] if ends[0] == ends[1] else None, follower)
-    dead: list[Tensor] = []
+    dead: list[torch.Tensor] = []
     for name, force in forces.items():
         with error_in(f"forces.{name}"):
             dead += [] if name in follower else [force.on(problem)]
