@@ -159,7 +159,7 @@ RUNS = {  # runs in which every own part has its turn, and what of them is expor
     ),
     "load family, network and solver over decades of moduli": (
         [
-            *("loads=tip", "model=own", "solver=modified", "mesh.nodes=[4,2,2]"),
+            *("loads=tip", "loads.size=1e-5", "model=own", "solver=modified", "mesh.nodes=[4,2,2]"),
             "young={low:1e6,high:1e10,distribution:log}",
         ],
         "[model,results]",
