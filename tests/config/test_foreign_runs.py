@@ -23,7 +23,7 @@ STORED = {  # options of train.py
     ],
     "fibres": [
         *("experiment=fibre_beam", "loads=point", "loads.region={_target_:dpl.fem.Tag,name:a}"),
-        *("model=pod", "callbacks=ema", "logger=wandb"),
+        *("callbacks=ema", "logger=wandb"),
     ],
     "growing": ["experiment=finger", "data=growing", "model=unrolled"],
 }
