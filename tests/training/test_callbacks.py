@@ -156,23 +156,10 @@ def test_a_single_load_with_a_nan_prediction_is_drawn_once_without_a_mesh(scene,
     assert not found.Tags()["tensors"]
 
 
-def test_meshes_can_be_left_out_and_numbers_are_at_least_one(scene, data, tmp_path):
-    trainer(tmp_path, WorstCasePlots(meshes=False)).fit(surrogate(scene), datamodule=data)
-    found = events(tmp_path)
-    assert found.Images("validation/shapes")
-    assert not found.Tags()["tensors"]
-    for option in ("every", "loads", "max_polygons"):
-        with pytest.raises(ValueError, match=f"{option} = 0 must be 1 or more"):
-            WorstCasePlots(**{option: 0})
-
-
 def test_pictures_do_not_change_the_training(scene, data, tmp_path):
-    """Bit for bit, with a network that draws random numbers in training."""
-    learnt = []
-    for name, callbacks in (
-        ("with", [WorstCasePlots(every=1), ThroughputMonitor()]),
-        ("without", []),
-    ):
+    """Bit for bit, with a network that draws random numbers in training; here without meshes."""
+    learnt, pictures = [], WorstCasePlots(every=1, meshes=False)
+    for name, callbacks in (("with", [pictures, ThroughputMonitor()]), ("without", [])):
         module = surrogate(scene)
         module.net.stages.append(torch.nn.Dropout(0.2))
         torch.manual_seed(1)
@@ -180,6 +167,15 @@ def test_pictures_do_not_change_the_training(scene, data, tmp_path):
         learnt.append(module.state_dict())
     for key, value in learnt[0].items():
         assert torch.equal(value, learnt[1][key]), key
+    found = events(tmp_path / "with")
+    assert found.Images("validation/shapes")
+    assert not found.Tags()["tensors"]
+
+
+@pytest.mark.parametrize("option", ["every", "loads", "max_polygons"])
+def test_numbers_of_pictures_are_at_least_one(option):
+    with pytest.raises(ValueError, match=f"{option} = 0 must be 1 or more"):
+        WorstCasePlots(**{option: 0})
 
 
 # ------------------------------------------------------------------ meshes
