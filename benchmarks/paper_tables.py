@@ -161,7 +161,8 @@ def paper(experiment: str, *, single: bool = False) -> list[Result]:
     rows = []
     for name, (e_mean, e_max, snr, *samples) in known.get(experiment, {}).items():
         error = None if snr is None else 10 ** (-snr / 20)
-        row = Result(name, title, count, *samples, e_mean=e_mean, e_max=e_max, SNR_min=snr)
+        learnt = next(iter(samples), None)
+        row = Result(name, title, count, learnt, e_mean=e_mean, e_max=e_max, SNR_min=snr)
         middle = error if single else None
         rows.append(replace(row, rel_L2_median=middle, rel_L2_worst=error))
     return rows
