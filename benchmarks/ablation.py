@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest import mock
 
 import torch
@@ -19,15 +19,16 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from benchmarks import CONF, paper_tables
-from benchmarks.samples import first, solved
-from benchmarks.study import METHOD_COLOURS, dots, dots_legend, picture, record
+from benchmarks.local_loads import linear_solution
+from benchmarks.samples import first, scaled, solved
+from benchmarks.study import METHOD_COLOURS, dots, dots_legend, label_decades, picture, record
 from dpl import Sample, config
 from dpl.commands.cli import command
 from dpl.fem import Material, ModalLoads
 from dpl.models import Unrolled
 from dpl.models.unrolled.features import SampleCells
 from dpl.system.threads import one_thread
-from dpl.training import ErrorMetrics
+from dpl.training.metrics import errors_of
 from dpl.visualization import COLOURS, draw_body
 
 Build = Callable[..., Unrolled]
@@ -46,11 +47,6 @@ class Variant:
     options: Mapping[str, Any] = field(default_factory=dict)  # arguments of `Unrolled` that differ
     # returns a context in which the variant is fitted and evaluated
     change: Callable[[], AbstractContextManager[Any]] = nullcontext
-
-    @property
-    def is_whole(self) -> bool:
-        """True if nothing differs from the configured model."""
-        return self == WHOLE
 
 
 WHOLE = Variant("all")
@@ -111,14 +107,6 @@ class _OneStress:
         return mock.patch.object(SampleCells, "features", features)
 
 
-def curve(
-    build: Build, samples: Sample, held_out: Sample, test: Sample, counts: Sequence[int]
-) -> Iterator[Row]:
-    """Yield a row for each number of loads to which the model is fitted."""
-    for count in counts:
-        yield fitted(WHOLE, build, first(samples, count), held_out, test, CURVE)[0]
-
-
 def fitted(
     variant: Variant, build: Build, samples: Sample, held_out: Sample, test: Sample, part: str
 ) -> tuple[Row, Unrolled]:
@@ -140,8 +128,8 @@ def other_loads(net: Unrolled, row: Row, test: Sample, count: int) -> Iterator[R
     scene, stream = net.scene, (0, OTHER_STREAM)
     sets = paper_tables.load_sets(scene, test, count)
     found = {title: sets[name] for name, title in OTHER_SETS.items()}
-    drawn = scene.loads.sample(stream, range(count))
-    found["3 times the range"] = solved(scene, drawn._replace(force=3 * drawn.force))
+    far = scaled(scene, OTHER_STREAM, torch.full((count,), 3.0).double())
+    found["3 times the range"] = solved(scene, far)
     if isinstance(scene.loads, ModalLoads):
         local = replace(scene.loads, patch_radius=(0.0, LOCAL_RADIUS))
         title = f"areas up to {LOCAL_RADIUS:g} L"
@@ -166,7 +154,7 @@ def errors(net: Unrolled, samples: Sample) -> dict[str, Any]:
                 for load, u in pairs
             ]
             corrected = torch.stack([state.displacement[0] for state in steps])
-    before, after = (_metrics(net, u, samples) for u in (predicted, corrected))
+    before, after = (errors_of(net.scene.problem, u, samples) for u in (predicted, corrected))
     known = {one.name for one in fields(Row)}
     return {
         "count": len(samples.force),
@@ -174,12 +162,6 @@ def errors(net: Unrolled, samples: Sample) -> dict[str, Any]:
         "e_mean_corrected": after["e_mean"],
         "rel_L2_worst_corrected": after["rel_L2_worst"],
     }
-
-
-def _metrics(net: Unrolled, predicted: Tensor, samples: Sample) -> dict[str, float]:
-    metrics = ErrorMetrics(net.scene.problem)
-    metrics.update(predicted, samples)
-    return {name: float(value) for name, value in metrics.compute().items()}
 
 
 COLOUR = METHOD_COLOURS["unrolled"]
@@ -205,7 +187,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         corrected = [row.e_mean_corrected for row in left_out]
         dots(ax, [row.variant for row in left_out], errors, corrected, [COLOUR] * len(errors))
         ax.set(xscale="log", xlabel="$e_{mean}$")
-        _set_ticks(ax.xaxis, "{x:.0e}")
+        label_decades(ax.xaxis, "{x:.0e}")
         ax.set_title(f"ablation, {left_out[0].samples} loads" if left_out else "", loc="left")
         dots_legend(figure, "prediction", "after one step in the modes")
 
@@ -215,62 +197,42 @@ def _draw_curve(ax: Any, x: Sequence[float], rows: Sequence[Row]) -> None:
     corrected = [row.e_mean_corrected for row in rows]
     ax.loglog(x, corrected, "o--", color=COLOUR, mfc="white", ms=4)
     ax.set_ylabel("$e_{mean}$")
-    _set_ticks(ax.xaxis, "{x:g}")
-    _set_ticks(ax.yaxis, "{x:.0e}")
+    label_decades(ax.xaxis)
+    label_decades(ax.yaxis, "{x:.0e}")
     ax.grid(visible=True)
-
-
-def _set_ticks(axis: Any, form: str) -> None:
-    """Put labelled ticks at 1, 2 and 5 of each decade."""
-    from matplotlib.ticker import LogLocator
-
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.set_major_formatter(form)
-    axis.set_minor_formatter("")
 
 
 def draw_method(net: Unrolled, test: Sample, path: Path) -> None:
     """Draw the steps of a prediction for the test load with the largest displacement."""
     panels = _panels(net, test)
-    shapes = [panel.displacement for panel in panels if panel.displacement is not None]
+    shapes = [displacement for _, displacement, *_ in panels if displacement is not None]
     problem = net.scene.problem
     kind = {"projection": "3d"} if problem.shape[1] == 3 else {}
     with picture(path, 4.4) as figure:
         figure.set_layout_engine("none")
         room = {"left": 0.01, "bottom": -0.02, "right": 0.99, "top": 0.9}
         axes = figure.subplots(2, 3, subplot_kw=kind, gridspec_kw={**room, "hspace": 0.25})
-        for k, (ax, panel) in enumerate(zip(axes.flat, panels, strict=True)):
-            draw_body(
-                ax, problem, panel.displacement, values=panel.values, colours="YlOrRd", fit=shapes
-            )
+        for ax, (title, displacement, values, points) in zip(axes.flat, panels, strict=True):
+            draw_body(ax, problem, displacement, values=values, colours="YlOrRd", fit=shapes)
             if kind:
                 sides = ax.get_xlim(), ax.get_ylim(), ax.get_zlim()
                 ax.set_box_aspect([high - low for low, high in sides], zoom=1.4)
-            ax.set_title(f"{k + 1}. {panel.title}")
-            if panel.points is not None:
+            ax.set_title(title)
+            if points is not None:
                 ax.computed_zorder = False  # of axes in 3D: the points lie inside the body
-                ax.scatter(*panel.points.T.numpy(), s=3, color=COLOURS[1], zorder=3)
+                ax.scatter(*points.T.numpy(), s=3, color=COLOURS[1], zorder=3)
 
 
-class _Panel(NamedTuple):
-    """A body that is drawn: title, displacement over L (N, D), values at nodes (N,), points."""
+def _panels(net: Unrolled, test: Sample) -> list[tuple[str, Tensor | None, Tensor | None, Any]]:
+    """Return the steps of a prediction for the test load with the largest displacement.
 
-    title: str
-    displacement: Tensor | None = None
-    values: Tensor | None = None
-    points: Tensor | None = None
-
-
-def _panels(net: Unrolled, test: Sample) -> list[_Panel]:
-    """Return the steps of a prediction for the test load with the largest displacement."""
+    A step has a title, a displacement over L (N, D), values at nodes (N,) and points to mark.
+    """
     problem, k = net.scene.problem, int(test.displacement.flatten(1).norm(dim=1).argmax())
     load = test.load.unbatch()[k]
     with torch.inference_mode():
         predicted = net(load.force, *((load.parameters,) if net.extra_inputs else ()))
-        loaded = load.force.flatten(1)[:, net.dofs]
-        linear = problem.prescribed.flatten().clone()
-        linear[net.dofs] = net.linear(loaded, load.parameters)[0]
-        linear = linear.view(problem.shape)
+        linear = linear_solution(net, load)[0]
         unbalanced = problem.residual(predicted, load.force)[0].norm(dim=1)
         solver = net.correction()
         last = predicted[0]
@@ -279,16 +241,14 @@ def _panels(net: Unrolled, test: Sample) -> list[_Panel]:
             last = state.displacement[0]
     sampled = f"strain or stress $\\varphi(G c)$\nat {len(net.cells)} cells"
     centres = (problem.points + linear)[problem.cells[net.cells]].mean(dim=1)
+    mapped = f"{1 + len(net.maps)} maps $c \\leftarrow c + \\varphi B_k$"
     return [
-        _Panel("load $f$", values=load.force[0].norm(dim=1)),
-        _Panel("linear solution\n$K(0)^{-1} f$", linear),
-        _Panel(sampled, linear, points=centres),
-        _Panel(
-            f"$K(0)^{{-1}} f + V c$\n{1 + len(net.maps)} maps $c \\leftarrow c + \\varphi B_k$",
-            predicted[0],
-        ),
-        _Panel("residual\n$r = f - f_{int}(u)$", predicted[0], unbalanced),
-        _Panel("Newton step in the modes\n$V^T K(u) V s = V^T r$", last),
+        ("1. load $f$", None, load.force[0].norm(dim=1), None),
+        ("2. linear solution\n$K(0)^{-1} f$", linear, None, None),
+        (f"3. {sampled}", linear, None, centres),
+        (f"4. $K(0)^{{-1}} f + V c$\n{mapped}", predicted[0], None, None),
+        ("5. residual\n$r = f - f_{int}(u)$", predicted[0], unbalanced, None),
+        ("6. Newton step in the modes\n$V^T K(u) V s = V^T r$", last, None, None),
     ]
 
 
@@ -321,12 +281,13 @@ def main(cfg: DictConfig) -> None:
     folder = Path(cfg.folder)
 
     def rows() -> Iterator[Row]:
-        yield from curve(build, samples, held_out, test, cfg.counts)
+        for count in cfg.counts:
+            yield fitted(WHOLE, build, first(samples, count), held_out, test, CURVE)[0]
         some = first(samples, cfg.ablation_loads)
         for variant in every:
             row, net = fitted(variant, build, some, held_out, test, ABLATION)
             yield row
-            if variant.is_whole:
+            if variant == WHOLE:
                 draw_method(net, test, folder / "unrolled_method.png")
                 whole = net, row
         yield from other_loads(*whole, test, cfg.count)

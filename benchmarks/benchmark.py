@@ -7,23 +7,25 @@ cases=[latency] run=runs/mine; loads on small areas: cases=[local] run=runs/mine
 """
 
 import statistics
+import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import torch
 from omegaconf import DictConfig
 
 from benchmarks import CONF, peers
 from benchmarks import deflections as reached
 from benchmarks import discretisation as meshes
-from benchmarks import generation as ways
 from benchmarks import sizes as beams
 from benchmarks.study import record
 from dpl import Scene, config
 from dpl.commands.cli import command
 from dpl.evaluation.tables import machine
-from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed_backends
+from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed_backends, symmetries
 from dpl.fem.linear import BACKENDS
 from dpl.inference import Simulator
 from dpl.system.threads import one_thread
@@ -136,9 +138,66 @@ def generation(cfg: DictConfig) -> None:
     rows = (
         replace(row, method=f"{name}: {row.method}")
         for name, scene in scenes.items()
-        for row in ways.costs(scene, cfg.samples)
+        for row in costs(scene, cfg.samples)
     )
     record(rows, Path(cfg.folder) / "generation", f"a sample on one core, {cfg.samples} loads")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of one method on the same loads, one at a time, on one core."""
+
+    method: str  # name of the method
+    seconds: float  # median time of a sample [s]
+    rate: float  # number of samples over the sum of their times [1/s]
+    # iterations, factorisations: mean numbers per sample
+    iterations: float
+    factorisations: float
+    accepted: int  # number of accepted samples
+
+
+def costs(scene: Scene, loads: int) -> list[Cost]:
+    """Return the cost of a sample of each method; the methods alternate on each load."""
+    newton = scene.newton
+    solvers = {
+        "a factor for every tangent": replace(newton, factor_reuse_tol=0.0),
+        "factors reused (the generator)": newton,
+    }
+    found: dict[str, list[tuple[Any, ...]]] = {method: [] for method in solvers}
+    for k in range(-1, loads):  # the first one is not timed
+        load = scene.loads.sample((1, 0), [max(k, 0)])
+        for method, solver in solvers.items():
+            start = time.perf_counter()
+            (*_, answer) = solver.iterate(load)
+            seconds = time.perf_counter() - start
+            count = int(answer.iterations), int(answer.factorisations), bool(answer.stable)
+            if k >= 0:
+                found[method].append((seconds, *count))
+    rows = []
+    for method, numbers in found.items():
+        taken, iterations, factors, accepted = zip(*numbers, strict=True)
+        rate, (a, b) = len(numbers) / sum(taken), map(statistics.mean, (iterations, factors))
+        rows.append(Cost(method, statistics.median(taken), rate, a, b, sum(accepted)))
+    return [*rows, _images(scene, rows[1])]
+
+
+def _images(scene: Scene, solved: Cost) -> Cost:
+    """Return the cost of a sample if the symmetric images of each solution count too."""
+    group = symmetries(scene.problem)
+    field = torch.zeros(2, *scene.problem.shape, dtype=torch.float64)
+    start = time.perf_counter()
+    for symmetry in group[1:]:
+        symmetry.image(field)
+    imaging = time.perf_counter() - start
+    count = len(group)
+    return Cost(
+        f"factors reused, {count} symmetries",
+        (solved.seconds + imaging) / count,
+        count / (1 / solved.rate + imaging),
+        solved.iterations / count,
+        solved.factorisations / count,
+        solved.accepted,
+    )
 
 
 def discretisation(cfg: DictConfig) -> None:

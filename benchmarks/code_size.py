@@ -17,16 +17,6 @@ from pathlib import Path
 IGNORED = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
 
 
-def function_lengths(tree: ast.AST) -> list[int]:
-    """Return the numbers of lines of all functions of a module, docstrings included."""
-    functions = (ast.FunctionDef, ast.AsyncFunctionDef)
-    return [
-        (node.end_lineno or node.lineno) - node.lineno + 1
-        for node in ast.walk(tree)
-        if isinstance(node, functions)
-    ]
-
-
 def code_lines(text: str) -> int:
     """Return the number of lines of a module that hold code."""
     found: set[int] = set()
@@ -53,7 +43,9 @@ def public_names(package: Path) -> int:
 def main(root: Path) -> None:
     """Print the numbers of a package."""
     modules = {path: path.read_text() for path in sorted(root.rglob("*.py"))}
-    lengths = [n for text in modules.values() for n in function_lengths(ast.parse(text))]
+    nodes = [node for text in modules.values() for node in ast.walk(ast.parse(text))]
+    functions = [n for n in nodes if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))]
+    lengths = [(node.end_lineno or node.lineno) - node.lineno + 1 for node in functions]
     lines = {path: len(text.splitlines()) for path, text in modules.items()}
     quantiles = statistics.quantiles(lengths, n=20)
     print(f"modules            {len(modules):8,}")

@@ -18,6 +18,7 @@ from rich.progress import Progress
 from benchmarks import CONF
 from benchmarks.methods import load_runs
 from benchmarks.plain_newton import PlainNewton
+from benchmarks.samples import scaled
 from benchmarks.study import dots, dots_legend, method_colours, picture, record
 from dpl import config
 from dpl.commands.cli import command
@@ -87,11 +88,8 @@ PAPER = [
 def load_sets(scene: Scene, count: int, *, twice: bool = True) -> dict[str, Load]:
     """Return `count` test loads, and as many that are scaled by 1 to 2."""
     part = torch.linspace(0, 1, count, dtype=torch.float64)
-    sets = {}
-    for name, factor in {"in range": 1 + 0 * part, "twice": 1 + part}.items():
-        drawn = scene.loads.sample((0, STREAMS[name]), range(count))
-        sets[name] = drawn._replace(force=factor[:, None, None] * drawn.force)
-    return sets if twice else {"in range": sets["in range"]}
+    factors = {"in range": 1 + 0 * part} | ({"twice": 1 + part} if twice else {})
+    return {name: scaled(scene, STREAMS[name], factor) for name, factor in factors.items()}
 
 
 def solvers_of(
@@ -101,14 +99,7 @@ def solvers_of(
     *,
     names: Sequence[str] | None = None,
 ) -> dict[tuple[str, str], Solver]:
-    """Return the solvers to compare, by name and network.
-
-    Args:
-        scene: The scene.
-        networks: Predictions by the name of their network.
-        tol: Relative residual [-].
-        names: Names of the solvers; None: all. `REFERENCE` is always one of them.
-    """
+    """Return the solvers to compare, by name and network; `REFERENCE` is always one of them."""
     robust, quick = (replace(one, tol=tol) for one in (scene.newton, scene.corrector))
     plain = PlainNewton(robust)
     solvers: dict[tuple[str, str], Solver] = {
@@ -159,11 +150,7 @@ def limited(trials: Sequence[Trial], limit: int) -> list[Trial]:
     """Return the results of `PLAIN` solvers as they are if iterations end at a limit.
 
     A plain Newton method does not depend on its limit before it is reached. A load that needs more
-    iterations has not converged.
-
-    Args:
-        trials: Results with a larger limit.
-        limit: Largest number of iterations, including one that the paper's rule discards.
+    iterations has not converged. The limit includes one that the paper's rule discards.
     """
     return [
         replace(

@@ -22,7 +22,7 @@ from lightning.fabric.utilities import move_data_to_device
 from omegaconf import DictConfig
 from torch import nn
 
-from benchmarks import CONF
+from benchmarks import CONF, methods
 from benchmarks.study import record
 from dpl import config
 from dpl.commands.cli import command
@@ -120,10 +120,7 @@ class Clock:
 def samples_of(scene: Scene, count: int = LOADS) -> Sample:
     """Return loads with artificial displacements of the size of linear solutions, on the CPU."""
     load = scene.loads.sample((0, 0), range(count))
-    linear = [
-        scene.linear.with_parameters(one.parameters).solve(one.force[0]) for one in load.unbatch()
-    ]
-    field = torch.stack(linear)
+    field = methods.linear(scene).predict(load)
     bent = field + field * field.norm(dim=-1, keepdim=True)  # `unrolled` fits a nonlinear part
     return Sample(load.force, bent, load.young, load.parameters)
 
@@ -142,7 +139,7 @@ def measure(
         dataset = surrogate.encode(samples)
         surrogate.to(clock.device)
     except OUT_OF_MEMORY as error:
-        print(f"left out: {name}: {first_line(error)}", flush=True)
+        print(f"left out: {name}: {error!r}", flush=True)
         return
     tasks: list[tuple[str, int, Callable[[], Callable[[], object]]]] = [
         (task, batch, partial(prediction, surrogate, samples, batch, copies=task == COPIED))
@@ -157,7 +154,10 @@ def measure(
         try:
             times, peak = clock.times(build())
         except OUT_OF_MEMORY as error:
-            print(f"left out: {name}, {task}, batch {batch}: {first_line(error)}", flush=True)
+            print(
+                f"left out: {name}, {task}, batch {batch}: {error!r}",
+                flush=True,
+            )
         else:
             ms, last = percentiles(torch.tensor(times, dtype=torch.float64))
             print(f"{name}, {task}, batch {batch}: {ms:.3g} ms, {peak:,.0f} MB", flush=True)
@@ -217,11 +217,6 @@ def prediction(
         return surrogate.predict(resident)
 
     return predict
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of the message of an error."""
-    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _moved(load: Load, device: torch.device) -> Load:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from benchmarks.verification.bodies import paper_beam
 from dpl import fem
 
 BEAM = (100.0, 25.0, 25.0)  # [m]
@@ -47,8 +48,7 @@ class Family:
 def _beam(
     law: fem.Material, cells: Cells, degree: int
 ) -> tuple[fem.Problem, Tensor, Callable[[Tensor], float]]:
-    mesh = fem.box(BEAM, [n + 1 for n in cells])
-    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=degree)
+    problem = paper_beam(law, cells, degree=degree)
     force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -LOAD / YOUNG]).on(problem)
     corner = (problem.points - problem.points.amax(dim=0)).norm(dim=1).argmin()
     return problem, force, lambda u: BEAM[0] * float(u[corner, 2])

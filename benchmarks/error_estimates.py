@@ -28,17 +28,15 @@ from benchmarks.study import OTHER_COLOURS, picture, record
 from dpl import Sample, Scene, config, fem
 from dpl.commands.cli import command
 from dpl.data import DataModule
+from dpl.evaluation.tables import power
 from dpl.inference import Simulator
 from dpl.models import FCNN, PODNet, Unrolled
 from dpl.training import MSE, Muon, RMSELoss, Surrogate, fit
 
 IN_RANGE, TWICE = "in range", "twice the range"
-CALLS: Mapping[str, Mapping[str, Any]] = {
-    "": {},
-    "error=1e-2": {"error": 1e-2},
-    "error=1e-3": {"error": 1e-3},
-    "tol=1e-3": {"tol": 1e-3},
-    "tol=1e-6": {"tol": 1e-6},
+CALLS: Mapping[str, Mapping[str, Any]] = {"": {}} | {
+    f"{name}={power(value)}": {name: value}
+    for name, value in (("error", 1e-2), ("error", 1e-3), ("tol", 1e-3), ("tol", 1e-6))
 }
 MODES = 60  # of the correction of `pod`
 SHARES = (0.05, 0.5, 0.95)  # quantiles of the ratio
@@ -81,22 +79,10 @@ class Row:
     missed: int  # number of these answers whose ratio is below `LEAST`
 
 
-def beam() -> Scene:
-    """Return the default beam."""
-    return _scene(
-        fem.Problem.build(
-            fem.box([100.0, 25.0, 25.0], [17, 5, 5]), fem.NeoHookeanLn(0.3), fixed=END
-        )
-    )
-
-
-def column() -> Scene:
-    """Return a column, ten times as long as thick."""
-    return _scene(
-        fem.Problem.build(
-            fem.box([100.0, 10.0, 10.0], [25, 4, 4]), fem.NeoHookeanLn(0.3), fixed=END
-        )
-    )
+def block(size: Sequence[float], nodes: Sequence[int], **options: Any) -> Scene:
+    """Return a block of NH-ln that is clamped at its end of smallest x."""
+    options = {"fixed": fem.Plane(0, "min"), **options}
+    return _scene(fem.Problem.build(fem.box(size, nodes), fem.NeoHookeanLn(0.3), **options))
 
 
 def bracket() -> Scene:
@@ -108,32 +94,19 @@ def bracket() -> Scene:
     return _scene(problem)
 
 
-def plate() -> Scene:
-    """Return a plate of quadratic hexahedra, fifty times as long as thick."""
-    mesh = fem.box([100.0, 50.0, 2.0], [13, 7, 2])
-    return _scene(fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), fixed=END, degree=2))
-
-
-END = fem.Plane(0, "min")
-BODIES: Mapping[str, Callable[[], Scene]] = {
-    "beam": beam,
-    "column": column,
-    "propeller": peers.propeller_scene,
-    "bracket": bracket,
-    "plate": plate,
-}
-
-
 def _scene(problem: fem.Problem) -> Scene:
     newton = fem.Newton(problem)
     return Scene(problem, fem.ModalLoads(newton.linear_solver, deflection=0.4), newton)
 
 
-def solved_data(scene: Scene, folder: Path, train: int, val: int, test: int) -> DataModule:
-    """Return the data set of a scene in a folder; missing loads are solved."""
-    data = DataModule(scene, folder=str(folder), train=train, val=val, test=test, workers=0)
-    data.prepare_data()
-    return data
+BODIES: Mapping[str, Callable[[], Scene]] = {
+    "beam": partial(block, [100.0, 25.0, 25.0], [17, 5, 5]),  # the default one
+    "column": partial(block, [100.0, 10.0, 10.0], [25, 4, 4]),  # ten times as long as thick
+    "propeller": peers.propeller_scene,
+    "bracket": bracket,
+    # quadratic cells, fifty times as long as thick
+    "plate": partial(block, [100.0, 50.0, 2.0], [13, 7, 2], degree=2),
+}
 
 
 def softened(scene: Scene, count: int, seed: int = 0) -> dict[str, Sample]:
@@ -348,7 +321,9 @@ def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator[Estimate]:
         start = time.perf_counter()
         scene = BODIES[body]()
         print(*scene.describe()[0], flush=True)
-        data = solved_data(scene, folder / "data" / body, cfg.train, cfg.val, cfg.test)
+        sizes = {"train": cfg.train, "val": cfg.val, "test": cfg.test, "workers": 0}
+        data = DataModule(scene, folder=str(folder / "data" / body), **sizes)
+        data.prepare_data()
         simulators = trained(scene, data, cfg.epochs)
         test = first(data.samples("test"), cfg.test)
         yield from estimates(body, scene, test, simulators, softened(scene, cfg.softened))

@@ -262,36 +262,25 @@ def against_amplitude(gripper: Gripper, grasps: Sequence[Grasp]) -> list[Amplitu
 
     Grasps without a reference solution are left out.
     """
-    raw = Gripper(gripper.surrogate, steps=0)
+    raw, scene = Gripper(gripper.surrogate, steps=0), gripper.scene
     factors = [2.0**-k for k in range(HALVINGS + 1)]
     errors: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
     for grasp in grasps:
         size = 0.0
         for factor in factors:
-            found = _errors_of_prediction(raw, grasp.scaled(factor))
-            if found is None:
+            part = grasp.scaled(factor)
+            patch = raw.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
+            if (known := references(scene, patch, part)) is None:
                 break
-            size = size or found[-1]
-            errors[factor].append((found[0] / size, found[1] / size))
+            exact = known[-1].displacement
+            size = size or float(exact.norm())
+            u = torch.from_numpy(raw(part.region, part.translation, part.rotation).displacement)
+            goal = patch.displacement([x / scene.length for x in part.translation], part.rotation)
+            linear = scene.linear.solve(patch.at(patch.stiffness_times(goal)))
+            off = (u / scene.length - exact).norm(), (linear - exact).norm()
+            errors[factor].append((float(off[0]) / size, float(off[1]) / size))
     columns = {factor: zip(*pairs, strict=True) for factor, pairs in errors.items() if pairs}
     return [Amplitude(factor, *map(median, both)) for factor, both in columns.items()]
-
-
-def _errors_of_prediction(raw: Gripper, grasp: Grasp) -> tuple[float, float, float] | None:
-    """Return the errors of the network and of the linear solution, and the size of the solution.
-
-    None without a reference solution.
-    """
-    scene = raw.scene
-    patch = raw.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
-    if (known := references(scene, patch, grasp)) is None:
-        return None
-    exact = known[-1].displacement
-    answer = raw(grasp.region, grasp.translation, grasp.rotation)
-    goal = patch.displacement([x / scene.length for x in grasp.translation], grasp.rotation)
-    linear = scene.linear.solve(patch.at(patch.stiffness_times(goal)))
-    u = torch.from_numpy(answer.displacement) / scene.length
-    return float((u - exact).norm()), float((linear - exact).norm()), float(exact.norm())
 
 
 def moving_hand(
@@ -356,8 +345,7 @@ KEYS = (
     (str, "name"),
     (int, "count", 1, 10**6),
     (int, "seed", 0, 10**9),
-    (int, "amplitudes", 1, 10**4),
-    (int, "hands", 1, 10**4),
+    (int, "amplitudes hands", 1, 10**4),
     (int, "frames", 10, 10**6),
 )
 

@@ -55,7 +55,8 @@ def call_times(simulator: Simulator, load: Load, *, repeats: int = 1) -> Iterato
     yield row("residual and min det F", evaluate, pairs)
     yield row("sim(force)", lambda one: simulator(**one), inputs)
     for options in OPTIONS:
-        words = "".join(f", {name}={_text(value)}" for name, value in options.items())
+        texts = {k: power(value) if value < 1 else f"{value:g}" for k, value in options.items()}
+        words = "".join(f", {name}={text}" for name, text in texts.items())
         more = [one | options for one in inputs]
         yield row(f"sim(force{words})", lambda one: simulator(**one), more)
     if scene.problem.shape[1] == 3:
@@ -82,7 +83,3 @@ def _frames(simulator: Simulator) -> Iterator[CallTime]:
     every = torch.tensor(times, dtype=torch.float64)
     for name, some in (("first frame", every[:, 0]), ("next frame", every[:, 1:].flatten())):
         yield CallTime(f"grasp, {name}", len(some), *percentiles(some))
-
-
-def _text(number: float) -> str:
-    return power(number) if number < 1 else f"{number:g}"

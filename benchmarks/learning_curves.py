@@ -1,16 +1,14 @@
 """Learning curves of runs: validation errors after each epoch that was validated."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.paper_tables import PLAIN
-from benchmarks.study import method_colours, picture, record
+from benchmarks.study import label_decades, method_colours, picture, record
 
 ERROR = "val/rel_L2_median"
 MARKS = "osD^v"  # of the runs of a method
-CSV_LOG = Path("csv", "metrics.csv")  # see conf/logger/csv.yaml
 
 
 @dataclass(frozen=True)
@@ -27,28 +25,15 @@ def curve(folder: Path) -> list[Validation]:
 
     A resumed run has several logs. Of an epoch that was validated twice, the last value counts.
     """
-    found = dict(_from_csv(folder / CSV_LOG))
-    for path in sorted(folder.glob("events.out.tfevents.*")):
-        found |= _from_events(path)
-    return [Validation(folder.name, epoch, found[epoch]) for epoch in sorted(found)]
-
-
-def _from_csv(path: Path) -> dict[int, float]:
-    if not path.is_file():
-        return {}
-    with path.open() as file:
-        rows = [row for row in csv.DictReader(file) if row.get(ERROR)]
-    return {int(row["epoch"]) + 1: float(row[ERROR]) for row in rows}
-
-
-def _from_events(path: Path) -> dict[int, float]:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    log = EventAccumulator(str(path)).Reload()
-    if not {"epoch", ERROR} <= set(log.Tags()["scalars"]):
-        return {}
-    epochs = {event.step: round(event.value) + 1 for event in log.Scalars("epoch")}
-    return {epochs[event.step]: event.value for event in log.Scalars(ERROR)}
+    found: dict[int, float] = {}
+    for path in sorted(folder.glob("events.out.tfevents.*")):
+        log = EventAccumulator(str(path)).Reload()
+        if {"epoch", ERROR} <= set(log.Tags()["scalars"]):
+            epochs = {event.step: round(event.value) + 1 for event in log.Scalars("epoch")}
+            found |= {epochs[event.step]: event.value for event in log.Scalars(ERROR)}
+    return [Validation(folder.name, epoch, found[epoch]) for epoch in sorted(found)]
 
 
 def save(runs: Sequence[Path], stem: Path) -> bool:
@@ -59,8 +44,6 @@ def save(runs: Sequence[Path], stem: Path) -> bool:
 
 def draw(rows: Sequence[Validation], path: Path) -> None:
     """Draw validation errors over epochs, a line for each run; dashed without the linear base."""
-    from matplotlib.ticker import LogLocator
-
     last = {row.method: row.rel_L2_median for row in rows}
     colours = method_colours(sorted(last, key=lambda name: -last[name]))
     with picture(path) as figure:
@@ -71,8 +54,6 @@ def draw(rows: Sequence[Validation], path: Path) -> None:
             style = {"marker": mark, "ms": 3.5, "lw": 1.2, "color": colour, "label": name}
             ax.loglog(*zip(*line, strict=True), ls="--" if PLAIN in name else "-", **style)
         ax.set(xlabel="epochs", ylabel="median relative L2 error")
-        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        ax.xaxis.set_major_formatter("{x:g}")
-        ax.xaxis.set_minor_formatter("")
+        label_decades(ax.xaxis)
         ax.grid(visible=True)
         ax.legend()

@@ -68,7 +68,7 @@ def _row(simulator: Simulator, name: str, deflection: float | None, load: Load) 
     exact = torch.cat([solution.displacement for _, solution in both if solution.converged])
     with torch.inference_mode():
         found = torch.cat([surrogate.predict(one) for one in singles])
-        linear = torch.cat([linear_solution(surrogate, one) for one in singles])
+        linear = torch.cat([linear_solution(cast(Unrolled, surrogate.net), one) for one in singles])
     solved = torch.cat([next(scene.linear.iterate(one)).displacement for one in singles])
     inputs: list[dict[str, Any]] = [scene.si_inputs(one) for one in singles]
     answers = torch.cat([simulator(**one).displacement for one in inputs]) / scene.length
@@ -79,9 +79,9 @@ def _row(simulator: Simulator, name: str, deflection: float | None, load: Load) 
     return LocalLoads(name, deflection, len(singles), *numbers)
 
 
-def linear_solution(surrogate: TrainedSurrogate, load: Load) -> Tensor:
-    """Return the linear solution that a fitted `Unrolled` uses, (1, N, D) [-]."""
-    problem, net = surrogate.scene.problem, cast(Unrolled, surrogate.net)
+def linear_solution(net: Unrolled, load: Load) -> Tensor:
+    """Return the linear solution that a fitted model uses, (1, N, D) [-]."""
+    problem = net.scene.problem
     field = problem.prescribed.clone()[None]
     field[:, problem.free] = net.linear(load.force[:, problem.free], load.parameters)
     return field

@@ -48,11 +48,7 @@ def linear(scene: Scene) -> Method:
 def pod_galerkin(scene: Scene, train: Sample, *, rank: int, tolerance: float) -> Method:
     """Return the hyper-reduced POD-Galerkin model with the linear solution as offset.
 
-    Args:
-        scene: The scene.
-        train: Training samples.
-        rank: Number of modes of the nonlinear part of displacements.
-        tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
+    It has `rank` modes of the nonlinear part of displacements; see `cubature` for the tolerance.
     """
     start = time.perf_counter()
     solver = PODGalerkin.fit(
@@ -83,13 +79,8 @@ def corrected(
 ) -> Method:
     """Return a network whose predictions are corrected by Newton iterations in its modes.
 
-    Args:
-        surrogate: A surrogate of a model that `HasCorrection`, or that has `vectors`, its modes.
-        method: The method of the network alone.
-        train: Training samples.
-        rank: Number of modes of the correction; a model which `HasCorrection` has chosen it.
-        tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
-        steps: Number of iterations, see `SubspaceNewton`.
+    The model `HasCorrection`, or it has `vectors`: then `rank` of them are the modes, and see
+    `cubature` for the tolerance. `method` is that of the network alone.
     """
     start = time.perf_counter()
     if (solver := surrogate.predictor.correction()) is None:
@@ -121,10 +112,8 @@ def load_runs(
 ) -> dict[str, tuple[DictConfig, TrainedSurrogate]]:
     """Return the configurations and surrogates of named runs in a folder, or of all.
 
-    Runs whose configurations have the same keys of the scene share one scene.
-
-    Raises:
-        ConfigError: There are none, or one cannot be used or belongs to another scene.
+    Runs whose configurations have the same keys of the scene share one scene. Raises ConfigError if
+    there are none, or if one cannot be used or belongs to another scene.
     """
     if names is None:
         names = sorted(path.parent.name for path in Path(folder).glob("*/config.yaml"))

@@ -54,16 +54,9 @@ def planned(
     scale: Mapping[str, Any],
     more: Sequence[str] = (),
 ) -> list[Run]:
-    """Return the runs of groups of a plan.
+    """Return the runs of groups of a plan, see `benchmarks/conf/paper.yaml`; None: of all groups.
 
-    Args:
-        plan: Groups by name, see `benchmarks/conf/paper.yaml`.
-        groups: Names of groups; None for all.
-        scale: Further options by experiment, then by path; those of "all" are added to each run.
-        more: Further options of all runs.
-
-    Raises:
-        ValueError: A group does not exist, or two runs have one path.
+    `scale` has further options by experiment and by path, and those of "all" for each run.
     """
     names = list(plan) if groups is None else list(groups)
     if unknown := [name for name in names if name not in plan]:
@@ -92,8 +85,9 @@ def _group(
                 path = Path(folder, inner, "-".join([own, *map(str, values)])).as_posix()
                 own_sizes = [*sizes, *scale.get(path, ())]
                 chosen = with_experiment(experiment, [*options, *special])
-                every = [*chosen, *swept, *own_sizes, *more]
-                yield Run(name, path, last_of_each_key(every))
+                # the last option of each key
+                last = {one.partition("=")[0]: one for one in [*chosen, *swept, *own_sizes, *more]}
+                yield Run(name, path, tuple(last.values()))
 
 
 def with_experiment(experiment: str, options: Sequence[str]) -> list[str]:
@@ -102,11 +96,6 @@ def with_experiment(experiment: str, options: Sequence[str]) -> list[str]:
     rest = [one for one in options if not one.startswith("experiment=")]
     choice = f"[{','.join([experiment, *recipes])}]" if recipes else experiment
     return [f"experiment={choice}", *rest]
-
-
-def last_of_each_key(options: Sequence[str]) -> tuple[str, ...]:
-    """Return options without those that a later one of the same key replaces."""
-    return tuple({option.partition("=")[0]: option for option in options}.values())
 
 
 def state(run: Run, root: Path) -> State:
@@ -130,12 +119,6 @@ def keep_options(run: Run, root: Path) -> None:
         (root / run.path / OPTIONS).write_text(json.dumps(run.options) + "\n")
 
 
-def fits_in_one_step(folder: Path) -> bool:
-    """Return True if the model of a run is fitted, so that its training cannot be resumed."""
-    model = checked_config(folder / "config.yaml").get("model", {})
-    return callable(getattr(get_object(model.get("_target_", "builtins.object")), "fit", None))
-
-
 def arguments(run: Run, root: Path, present: State) -> tuple[str, list[str]]:
     """Return the script that finishes a run, and its arguments.
 
@@ -143,9 +126,10 @@ def arguments(run: Run, root: Path, present: State) -> tuple[str, list[str]]:
     their last checkpoint if there is one.
     """
     folder = root / run.path
-    fitted = (folder / "checkpoints" / "last.ckpt").is_file()
-    if present == State.INTERRUPTED and fitted and fits_in_one_step(folder):
-        return "evaluate", [f"run={folder}"]
+    if present == State.INTERRUPTED and (folder / "checkpoints" / "last.ckpt").is_file():
+        model = checked_config(folder / "config.yaml").get("model", {})
+        if hasattr(get_object(model.get("_target_", "builtins.object")), "fit"):
+            return "evaluate", [f"run={folder}"]
     return "train", [*run.options, f"run={folder}", "ckpt_path=last"]
 
 
@@ -181,7 +165,11 @@ def main(cfg: DictConfig) -> None:
         return
     failed = _train(runs, states, root)
     if cfg.tables:
-        failed += _write_tables(root, folder, scale)
+        inner = ",".join(f"'{option}'" for option in scale["convergence"])
+        line = ["name=all", f"runs={root}", f"folder={folder}", f"convergence=[{inner}]"]
+        print(f"\n[tables] results {' '.join(line)}", flush=True)
+        if run_script("results", [*line, *scale["results"]]):
+            failed.append("tables")
     if failed:
         print(f"failed: {', '.join(failed)}; run the same command again", file=sys.stderr)
         sys.exit(1)
@@ -222,12 +210,3 @@ def _train(runs: Sequence[Run], states: Sequence[State], root: Path) -> list[str
         left = f"{len(missing) - number} runs left, {minutes:.1f} min so far"
         print(f"{run.path}: {left}", flush=True)
     return failed
-
-
-def _write_tables(root: Path, folder: Path, scale: dict[str, list[str]]) -> list[str]:
-    """Write tables and figures of all experiments; return the name of the script if it failed."""
-    inner = ",".join(f"'{option}'" for option in scale["convergence"])
-    arguments = ["name=all", f"runs={root}", f"folder={folder}", f"convergence=[{inner}]"]
-    print(f"\n[tables] results {' '.join(arguments)}", flush=True)
-    status = run_script("results", [*arguments, *scale["results"]])
-    return ["tables"] if status else []

@@ -1,21 +1,21 @@
 """Errors, run times and sizes of all methods on one scene and three sets of loads."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from benchmarks.methods import Method
-from benchmarks.samples import solved
+from benchmarks.samples import scaled, solved
 from benchmarks.study import dots, dots_legend, method_colours, picture, read
 from dpl import Sample, Scene
 from dpl.evaluation import latency
-from dpl.fem import Load, Newton
+from dpl.fem import Newton
 from dpl.system.threads import one_thread
-from dpl.training import ErrorMetrics
+from dpl.training.metrics import errors_of
 
 # Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples. Experiments 3
 # and 3b differ in the range of Young's modulus, on which only networks with E as an input depend.
@@ -26,10 +26,7 @@ PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int | None]]
         "paper": (7.7e-6, 0.03, 2.7, 4095),  # with L_r^*
         "paper, mse": (5.2e-5, 0.05, -5.1, 4095),
     },
-    "beam_young": {
-        "paper": (4.6e-5, 0.09, -2.6, 10650),
-        "paper, 3b": (1e-4, None, None, None),
-    },
+    "beam_young": {"paper": (4.6e-5, 0.09, -2.6, 10650), "paper, 3b": (1e-4, None, None, None)},
     "beam_young_wide": {"paper": (1e-4, None, None, None)},  # "at best"
 }
 # Odot, Haferssas, Cotin (2022), tables 2, 4 and 6: e_mean, e_max, SNR [dB] of one load
@@ -109,14 +106,10 @@ def load_sets(scene: Scene, test: Sample, count: int = 50) -> dict[str, Sample]:
 
     Loads that have no stable answer are left out.
     """
-    sets = {"in range": test}
     part = torch.linspace(0, 1, count, dtype=torch.float64)
     factors = {"twice": 1 + part, "small": 10.0 ** (part - 2)}
-    for name, factor in factors.items():
-        drawn = scene.loads.sample((0, STREAMS[name]), range(count))
-        load = drawn._replace(force=factor[:, None, None] * drawn.force)
-        sets[name] = solved(scene, load)
-    return sets
+    sets = {name: solved(scene, scaled(scene, STREAMS[name], f)) for name, f in factors.items()}
+    return {"in range": test, **sets}
 
 
 def measure(
@@ -138,11 +131,14 @@ def measure(
             for name, method in methods.items():
                 answer = torch.cat([method.predict(load) for load in singles])
                 taken = latency(method.predict, singles, repeats=repeats)
-                iterations = None if title in STREAMS else _iterations(newton, singles, answer)
-                errors = ErrorMetrics(newton.problem)
-                errors.update(answer, batch)
+                iterations = None
+                if title not in STREAMS:
+                    pairs = zip(singles, answer, strict=True)
+                    ends = [list(newton.iterate(load, guess=u[None]))[-1] for load, u in pairs]
+                    iterations = sum(int(end.iterations[0]) for end in ends) / len(ends)
+                errors = errors_of(newton.problem, answer, batch)
                 known = {field.name for field in fields(Result)}
-                numbers = {k: float(v) for k, v in errors.compute().items() if k in known}
+                numbers = {name: error for name, error in errors.items() if name in known}
                 yield Result(
                     method=name,
                     loads=title,
@@ -158,36 +154,17 @@ def measure(
                 )
 
 
-def _iterations(newton: Newton, loads: Sequence[Load], guesses: Tensor) -> float:
-    """Return the mean number of Newton iterations from guesses (S, N, D) [-]."""
-    total = 0
-    for load, guess in zip(loads, guesses, strict=True):
-        *_, last = newton.iterate(load, guess=guess[None])
-        total += int(last.iterations[0])
-    return total / len(loads)
-
-
-def paper(experiment: str) -> list[Result]:
-    """Return the rows of the paper for an experiment; empty if the paper has none."""
+def paper(experiment: str, *, single: bool = False) -> list[Result]:
+    """Return the rows of the paper for an experiment, or for its single loads, if it has any."""
+    known: Mapping[str, Mapping[str, tuple[Any, ...]]] = PAPER_SINGLE if single else PAPER
+    title, count = (ONE, 1) if single else ("in range", 100)
     rows = []
-    for name, (e_mean, e_max, snr, samples) in PAPER.get(experiment, {}).items():
-        worst = None if snr is None else 10 ** (-snr / 20)
-        rows.append(
-            Result(
-                name, "in range", 100, samples, e_mean=e_mean, e_max=e_max, SNR_min=snr,
-                rel_L2_worst=worst,
-            )
-        )  # fmt: skip
-    return rows
-
-
-def paper_single(experiment: str) -> list[Result]:
-    """Return the rows of the single loads of the paper for an experiment, or none."""
-    rows = []
-    for name, (e_mean, e_max, snr) in PAPER_SINGLE.get(experiment, {}).items():
-        error = 10 ** (-snr / 20)
-        rows.append(Result(name, ONE, 1, e_mean=e_mean, e_max=e_max, SNR_min=snr,
-                           rel_L2_median=error, rel_L2_worst=error))  # fmt: skip
+    for name, (e_mean, e_max, snr, *samples) in known.get(experiment, {}).items():
+        error = None if snr is None else 10 ** (-snr / 20)
+        learnt = next(iter(samples), None)
+        row = Result(name, title, count, learnt, e_mean=e_mean, e_max=e_max, SNR_min=snr)
+        middle = error if single else None
+        rows.append(replace(row, rel_L2_median=middle, rel_L2_worst=error))
     return rows
 
 

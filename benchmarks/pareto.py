@@ -15,12 +15,12 @@ from omegaconf import DictConfig
 from rich.progress import Progress
 
 from benchmarks import CONF, methods
-from benchmarks.study import method_colours, picture, record
+from benchmarks.study import label_decades, method_colours, picture, record
 from dpl import config, inference
 from dpl.commands.cli import command
 from dpl.data import DataModule
 from dpl.evaluation.timing import WARM_UP, percentiles
-from dpl.fem import Load, Solution, Solver, solve
+from dpl.fem import Solver, solve
 from dpl.scene import Sample
 from dpl.system.threads import available_cores, limited_threads
 from dpl.training import TrainedSurrogate, relative_errors
@@ -73,10 +73,14 @@ def points(
         for name, solver in solvers.items():
             for load in singles[:WARM_UP]:
                 solve(solver, load)
-            paths = [time_iterates(solver, load) for load in singles]
+            paths = []  # for each load the wall times up to each iterate [ms], and the iterates
+            for load in singles:
+                start = time.perf_counter()
+                states = solver.iterate(load)
+                paths.append([(1e3 * (time.perf_counter() - start), one) for one in states])
             count = max(map(len, paths))
             for k in range(count):
-                iterates = [states[min(k, len(states) - 1)] for states in paths]
+                iterates = [path[min(k, len(path) - 1)] for path in paths]
                 times = torch.tensor([ms for ms, _ in iterates], dtype=torch.float64)
                 displacement = torch.cat([state.displacement for _, state in iterates])
                 error = relative_errors(displacement, batch)
@@ -88,22 +92,15 @@ def points(
     return found
 
 
-def time_iterates(solver: Solver, load: Load) -> list[tuple[float, Solution]]:
-    """Return all iterates of a solver, each with the wall time up to it [ms]."""
-    start = time.perf_counter()
-    return [(1e3 * (time.perf_counter() - start), state) for state in solver.iterate(load)]
-
-
 def draw(rows: Sequence[Point], path: Path) -> None:
     """Draw run time against error of the iterates of solvers, with the first number of threads.
 
     Each method has one colour: a dot for its prediction, a line through the iterates.
     """
-    from matplotlib.ticker import LogLocator
-
     rows = [row for row in rows if row.threads == rows[0].threads]
     solvers = list(dict.fromkeys(row.solver for row in rows))
-    families = {name: _family(name) for name in solvers}
+    # the method of a solver without its variant and tolerance
+    families = {name: name.partition(", ")[0].partition(" to ")[0] for name in solvers}
     with picture(path, 4.4) as figure:
         ax = figure.subplots()
         for family, colour in method_colours(dict.fromkeys(families.values())).items():
@@ -124,9 +121,7 @@ def draw(rows: Sequence[Point], path: Path) -> None:
         ax.set_xlabel("time of one load [ms], median")
         ax.set_ylabel("relative error, median of the loads")
         ax.set_ylim(top=10)
-        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        ax.xaxis.set_major_formatter("{x:g}")
-        ax.xaxis.set_minor_formatter("")
+        label_decades(ax.xaxis)
         ax.grid(visible=True)
         figure.legend(loc="outside right upper")
 
@@ -140,11 +135,6 @@ def _draw_line(ax: "Axes", line: Sequence[Point], colour: str) -> None:
     x, y = [row.ms for row in shown], [max(row.error, LEAST) for row in shown]
     ax.loglog(x, y, lw=1.2, ms=3, **style)
     ax.loglog(x[-1:], y[-1:], ms=7, **style)
-
-
-def _family(name: str) -> str:
-    """Return the method of a solver without its variant and tolerance."""
-    return name.partition(", ")[0].partition(" to ")[0]
 
 
 METHODS = (dict | None, "galerkin corrected")  # keys of `trained_methods`

@@ -8,6 +8,7 @@ size, a beam of 100,000 degrees of freedom, and thousands of random loads.
 import json
 import math
 import os
+import re
 import resource
 import statistics
 import subprocess
@@ -21,11 +22,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks import blas_detection
 from dpl import Scene, fem
 from dpl.data.solving.solve import LoadKey
 from dpl.data.solving.worker_pool import solve_loads
 from dpl.fem.linear import make_backend, select_backend
+
+REFERENCE_BLAS = "reference BLAS"
+FAMILIES = {"openblas": "OpenBLAS", "mkl": "MKL", "blis": "BLIS", "atlas": "ATLAS"}
+FILE = re.compile(r"lib(c?blas|\w*openblas|mkl_|blis|[st]?atlas)")
+FOLDERS = "/usr/lib/*/openblas*/libblas.so.3"  # where Debian puts OpenBLAS as a BLAS
 
 
 @dataclass(frozen=True)
@@ -148,12 +153,12 @@ def time_reference_code(python: str, program: Path, repeats: int) -> dict[str, T
     }
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")} | threads
-    used = blas_detection.name(_run_program(python, program, {}, environment)["libraries"])
-    if used == blas_detection.REFERENCE and (folder := blas_detection.optimised()):
+    used = name_of_blas(_run_program(python, program, {}, environment)["libraries"])
+    if used == REFERENCE_BLAS and (folder := optimised_blas()):
         before = environment.get("LD_LIBRARY_PATH")
         environment["LD_LIBRARY_PATH"] = f"{folder}:{before}" if before else folder
-        used = blas_detection.name(_run_program(python, program, {}, environment)["libraries"])
-    if used in (None, blas_detection.REFERENCE):
+        used = name_of_blas(_run_program(python, program, {}, environment)["libraries"])
+    if used in (None, REFERENCE_BLAS):
         reason = "the reference BLAS, which is several times slower" if used else "no known BLAS"
         raise OSError(
             f"{program.name} with {python}: it uses {reason}; install OpenBLAS "
@@ -167,6 +172,28 @@ def time_reference_code(python: str, program: Path, repeats: int) -> dict[str, T
         note = ", ".join(filter(None, [f"tip to {error:.0e} L", row.get("note"), used]))
         rows[name] = Time(program.stem, row["seconds"], row["iterations"], note)
     return rows
+
+
+def name_of_blas(libraries: Sequence[str]) -> str | None:
+    """Return the name of the BLAS among shared libraries; None if there is none among them.
+
+    Netlib's reference BLAS is named wherever it is loaded, whatever else is. Debian gives every
+    BLAS the file name `libblas.so.3`; the folder tells them apart.
+    """
+    found = set()
+    for library in libraries:
+        path = Path(library)
+        if not FILE.match(path.name):
+            continue
+        words = f"{path.parent.name} {path.name}".lower()
+        found.add(next((title for key, title in FAMILIES.items() if key in words), REFERENCE_BLAS))
+    return REFERENCE_BLAS if REFERENCE_BLAS in found else " and ".join(sorted(found)) or None
+
+
+def optimised_blas(pattern: str = FOLDERS) -> str | None:
+    """Return a folder whose `libblas.so.3` is OpenBLAS, for `LD_LIBRARY_PATH`; None without one."""
+    found = sorted(Path("/").glob(pattern.lstrip("/")))
+    return str(found[0].parent) if found else None
 
 
 def _run_program(
@@ -273,7 +300,7 @@ def propellers(linear: str, loads: int) -> Time:
     """Return the median time of a random load on the propeller."""
     scene = propeller_scene(linear)
     batch = scene.loads.sample(0, range(loads))
-    singles = [fem.Load(batch.force[k : k + 1], batch.young[k : k + 1]) for k in range(loads)]
+    singles = batch.unbatch()
     fem.solve(scene.solver, singles[0])
     answers = [fem.solve(scene.solver, load) for load in singles]
     seconds = statistics.median(float(answer.seconds) for answer in answers)

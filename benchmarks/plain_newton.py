@@ -25,10 +25,6 @@ class PlainNewton:
     solver: Newton  # Newton solver that provides problem, linear solver and tolerance
     max_iter: int = 20  # maximum number of iterations
 
-    def __post_init__(self) -> None:
-        if self.max_iter < 1:
-            raise ValueError(f"max_iter = {self.max_iter} must be 1 or more")
-
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
         """Yield the state of all loads at a guess (B, N, D) [-], or zero, and after each step.
 

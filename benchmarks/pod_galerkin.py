@@ -94,13 +94,9 @@ class PODGalerkin:
     def fit(
         cls, problem: Problem, snapshots: Tensor, rank: int, *, tolerance: float, lift: LinearSolver
     ) -> Self:
-        """Return the solver with basis and cells computed from equilibria.
+        """Return the solver with basis and cells computed from equilibria (S, N, D) [-].
 
-        Args:
-            problem, lift: Attributes of the solver.
-            snapshots: Displacements in equilibrium, (S, N, D) [-].
-            rank: Dimension R of the subspace.
-            tolerance: Relative error of their reduced forces [-], see `cubature`.
+        The subspace has the dimension `rank`; `tolerance` is that of `cubature`.
         """
         for name, ends in problem.material.parameter_ranges.items():
             raise ValueError(
@@ -163,7 +159,7 @@ class PODGalerkin:
                 return None, k + 1
             before, ratio = ratio, _residual(load, new, target)
             if new.factor == target:
-                is_short = not jump and _norm(step) < 1e-2 * TOL * target * load.scale
+                is_short = not jump and float(step.norm()) < 1e-2 * TOL * target * load.scale
                 if ratio < TOL or is_short:
                     return new, k + 1
             if ratio >= FACTOR_REUSE_TOL:
@@ -189,7 +185,7 @@ class PODGalerkin:
         """Return a load (N, D) in reduced coordinates."""
         support = self.problem.support_force
         reduced = force.flatten() @ self._rows
-        scale = _norm((force - support).flatten() @ self._rows)
+        scale = float(((force - support).flatten() @ self._rows).norm())
         offset = self.problem.prescribed + _linear_solution(self.lift, force - support)
         cell_offset = offset[self.cells.nodes].flatten()
         error = reduced - cell_offset @ self._stiffness
@@ -206,11 +202,8 @@ class PODGalerkin:
 
     def _internal(self, load: _Load, force: Tensor, y: Tensor, factor: float) -> Tensor:
         """Return the reduced internal force of the body, (R,), from that of the chosen cells."""
-        return self._project(force) + self._stiffness_error @ y + factor * load.offset_error
-
-    def _project(self, force: Tensor) -> Tensor:
-        """Return W^T f, (R,), of forces on the cells' nodes."""
-        return force.flatten() @ self.cells.basis
+        of_cells = force.flatten() @ self.cells.basis
+        return of_cells + self._stiffness_error @ y + factor * load.offset_error
 
     def _cell_tangents(self, entries: Tensor) -> Tensor:
         """Return U, (C, A D, A D), with U + U^T the cells' matrices, of their entries (nnz,)."""
@@ -232,7 +225,7 @@ class PODGalerkin:
             system = cells.problem.linearise(state.cell_displacement)
         upper = self._cell_tangents(system.tangent[0])
         right = target * load.force - self._internal(load, system.force, state.y, state.factor)
-        pull = self._project(_product(upper, load.cell_offset))
+        pull = _product(upper, load.cell_offset).flatten() @ cells.basis
         right -= jump * (pull + load.offset_error)
         rows = self._single.view(*upper.shape[:2], -1)  # float32 in half the time of float64
         product = self._single.T @ (upper.float() @ rows).flatten(0, 1)
@@ -252,7 +245,7 @@ class PODGalerkin:
 
 def _residual(load: _Load, state: _State, target: float) -> float:
     """Return the reduced relative residual under `target` times a load."""
-    return _norm(target * load.force - state.internal) / (target * load.scale)
+    return float((target * load.force - state.internal).norm()) / (target * load.scale)
 
 
 def _product(upper: Tensor, values: Tensor) -> Tensor:
@@ -271,14 +264,6 @@ def _broyden(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
     if not scale.abs() > 1e-8 * step.norm() * predicted.norm():
         return inverse
     return inverse + torch.outer((step - predicted) / scale, step @ inverse)
-
-
-def _norm(vector: Tensor) -> float:
-    """Return the Euclidean norm of a vector (R,), without overflow or underflow of squares."""
-    largest = float(vector.abs().amax())
-    if not 0 < largest < math.inf:
-        return largest
-    return largest * float(torch.linalg.vector_norm(vector / largest))
 
 
 def _linear_solution(lift: LinearSolver, force: Tensor) -> Tensor:

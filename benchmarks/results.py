@@ -6,23 +6,75 @@ the figures of all CSV files in `folder` again.
 """
 
 import importlib
+import json
+import math
 import pkgutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 import benchmarks
-from benchmarks import CONF, learning_curves, loss_table, methods, paper_tables
+from benchmarks import CONF, learning_curves, methods, paper_tables
+from benchmarks.methods import training_minutes
 from benchmarks.pareto import METHODS, trained_methods
 from benchmarks.study import Draw, read, record
 from benchmarks.subcommands import run_script
 from dpl import config
 from dpl.commands.cli import command
+from dpl.evaluation.tables import PREDICTION
+from dpl.training.metrics import median
 
 EXPERIMENTS = ("beam_svk", "propeller_nh", "beam_nh_loss", "beam_young", "beam_young_wide")
 OF_CONVERGENCE = "beam_svk"  # experiment whose networks start Newton's method in experiment 4
+LOSS_METRICS = ("e_mean", "e_max", "SNR_min", "rel_L2_median", "rel_L2_worst", "residual")
+HYBRID = "paper's hybrid"  # begins the name of its row in an evaluation
+
+
+@dataclass(frozen=True)
+class LossRow:
+    """Medians over the runs of a loss with different seeds."""
+
+    runs: str  # common name of the runs, network and loss
+    seeds: int  # number of runs
+    # e_mean, e_max, SNR_min, rel_L2_median, rel_L2_worst, residual: See `dpl.training.metrics`; of
+    # the test loads
+    e_mean: float
+    e_max: float
+    SNR_min: float
+    rel_L2_median: float
+    rel_L2_worst: float
+    residual: float
+    hybrid_iterations: float  # mean iterations of the paper's hybrid from the predictions
+    training_minutes: float  # wall time of a training [min]
+
+
+def loss_numbers(folder: Path) -> list[float]:
+    """Return the numbers of a run in the order of `LossRow`; NaN where one is unknown."""
+    rows = {row["solver"]: row for row in json.loads((folder / "evaluation.json").read_text())}
+    errors = rows[PREDICTION]["errors"]
+    hybrids = [row["iterations"] for name, row in rows.items() if name.startswith(HYBRID)]
+    minutes = training_minutes(folder)
+    return [
+        *(float(errors.get(name, math.nan)) for name in LOSS_METRICS),
+        float(hybrids[0]) if hybrids else math.nan,
+        math.nan if minutes is None else minutes,
+    ]
+
+
+def loss_rows(runs: Mapping[str, Sequence[float]]) -> list[LossRow]:
+    """Return a row for each group of runs whose names differ only in the seed at their end."""
+    groups: dict[str, list[Sequence[float]]] = {}
+    for name, values in runs.items():
+        stem, _, seed = name.rpartition("-")
+        groups.setdefault(stem if stem and seed.isdigit() else name, []).append(values)
+    return [
+        LossRow(name, len(members), *median(torch.tensor(members, dtype=torch.float64)).tolist())
+        for name, members in groups.items()
+    ]
 
 
 def finished_runs(folder: Path) -> list[str]:
@@ -44,30 +96,21 @@ def measure_all(cfg: DictConfig) -> list[str]:
             measure(OmegaConf.merge(cfg, own))
         except (config.ConfigError, ValueError) as error:
             left_out.append(f"{name}: {error}")
-    left_out += _losses(root / "losses", folder)
-    left_out += _convergence(cfg, root / OF_CONVERGENCE, folder)
+    runs = root / "losses"
+    if names := finished_runs(runs):
+        rows = loss_rows({name: loss_numbers(runs / name) for name in names})
+        record(rows, folder / "losses", "losses: medians over seeds")
+    else:
+        left_out.append(f"losses: no finished run below {runs}")
+    runs = root / OF_CONVERGENCE
+    if names := finished_runs(runs):
+        options = [f"run={runs}", f"networks=[{','.join(names)}]", f"folder={folder}"]
+        print(f"\nconvergence: {', '.join(names)}", flush=True)
+        if status := run_script("convergence", [*options, *cfg.convergence]):
+            left_out.append(f"convergence: ended with status {status}")
+    else:
+        left_out.append(f"convergence (experiment 4): no finished run below {runs}")
     return left_out
-
-
-def _losses(runs: Path, folder: Path) -> list[str]:
-    """Write the table of losses; return why it is left out."""
-    names = finished_runs(runs)
-    if not names:
-        return [f"losses: no finished run below {runs}"]
-    rows = loss_table.summaries({name: loss_table.numbers(runs / name) for name in names})
-    record(rows, folder / "losses", "losses: medians over seeds")
-    return []
-
-
-def _convergence(cfg: DictConfig, runs: Path, folder: Path) -> list[str]:
-    """Run the command of experiment 4; return why it is left out."""
-    names = finished_runs(runs)
-    if not names:
-        return [f"convergence (experiment 4): no finished run below {runs}"]
-    options = [f"run={runs}", f"networks=[{','.join(names)}]", f"folder={folder}"]
-    print(f"\nconvergence: {', '.join(names)}", flush=True)
-    status = run_script("convergence", [*options, *cfg.convergence])
-    return [f"convergence: ended with status {status}"] if status else []
 
 
 def figures() -> list[tuple[type, Draw[Any]]]:
@@ -124,7 +167,7 @@ def measure(cfg: DictConfig) -> None:
     if cfg.single:
         networks = {name: methods.Method(one.predict) for name, (_, one) in runs.items()}
         sets = paper_tables.one_load(data.samples("test"), cfg.deflection)
-        found = paper_tables.paper_single(cfg.name)
+        found = paper_tables.paper(cfg.name, single=True)
         found += paper_tables.measure(networks, sets, scene.newton)
         record(found, stem, f"{cfg.name}, one load", paper_tables.draw)
         return

@@ -29,11 +29,11 @@ from benchmarks.study import picture, record
 from benchmarks.subcommands import run_script
 from dpl import Sample, config
 from dpl.commands.cli import command
+from dpl.data.samples import Samples
 from dpl.evaluation.timing import latency
-from dpl.fem.symmetry import SymmetryGroup
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
-from dpl.training import ErrorMetrics
+from dpl.training.metrics import errors_of
 from dpl.training.predictors import OnLinearSolution, Predictor, Scaled
 
 Array = NDArray[np.float64]
@@ -361,16 +361,6 @@ def rivals(
             yield name, base, predictor, time.process_time() - start, net.weights
 
 
-def with_images(samples: Sample, group: SymmetryGroup) -> Sample:
-    """Return samples followed by their images under the symmetries of a body."""
-    members = range(max(1, len(group)))
-    fields = (
-        torch.cat([group.images(field, torch.full((len(field),), k)) for k in members])
-        for field in samples[:2]
-    )
-    return Sample(*fields, *(torch.cat([column] * len(members)) for column in samples[2:]))
-
-
 def own(
     scene: Scene, names: Sequence[str], loads: int, folder: Path, seconds: float
 ) -> Iterator[tuple[str, str, Predictor, float, int]]:
@@ -398,9 +388,8 @@ def measured(
     found: dict[str, dict[str, float]] = {}
     with one_thread(), torch.inference_mode():
         for title, samples in sets.items():
-            errors = ErrorMetrics(predictor.problem)
-            errors.update(torch.cat([predictor(load) for load in samples.load.unbatch()]), samples)
-            found[title] = {key: float(value) for key, value in errors.compute().items()}
+            answers = torch.cat([predictor(load) for load in samples.load.unbatch()])
+            found[title] = errors_of(predictor.problem, answers, samples)
     time_of = latency(predictor, sets["in range"].load.unbatch(), repeats=3)
     others = {
         f"{title}_{which}": found[title][f"rel_L2_{which}"]
@@ -415,13 +404,8 @@ def measured(
 
 
 def linear_solution(scene: Scene) -> tuple[str, str, Predictor, float, int]:
-    """Return the linear solution alone as a method."""
-
-    class Nothing(nn.Module):
-        def forward(self, field: Tensor, scalars: Tensor) -> Tensor:
-            return torch.zeros_like(field)
-
-    return "linear solution", "linear", OnLinearSolution(Nothing(), scene), 0.0, 0
+    """Return the linear solution alone as a method: a network before its fit adds zeros."""
+    return "linear solution", "linear", OnLinearSolution(Learner(), scene), 0.0, 0
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
@@ -464,7 +448,8 @@ def main(cfg: DictConfig) -> None:
     def rows() -> Iterator[Row]:
         yield measured(linear_solution(scene), 0, sets)
         for loads in cfg.counts:
-            some = with_images(first(train, loads), data.group)
+            every = Samples(first(train, loads), data.group)
+            some = every.__getitems__(list(range(len(every))))
             for method in rivals(scene, some, held, cfg.rivals, cfg.seconds):
                 yield measured(method, loads, sets)
             for method in own(scene, cfg.models, loads, folder / "runs", cfg.seconds):

@@ -1,5 +1,7 @@
 """Solved loads of a scene."""
 
+from torch import Tensor
+
 from dpl import Sample, Scene
 from dpl.fem import Load, Status, solve
 
@@ -15,3 +17,9 @@ def solved(scene: Scene, load: Load) -> Sample:
 def first(samples: Sample, count: int) -> Sample:
     """Return the first samples."""
     return Sample(*(column[:count] for column in samples))
+
+
+def scaled(scene: Scene, stream: int, factors: Tensor) -> Load:
+    """Return loads of a random stream times factors (B,)."""
+    drawn = scene.loads.sample((0, stream), range(len(factors)))
+    return drawn._replace(force=factors[:, None, None] * drawn.force)

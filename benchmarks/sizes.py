@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.devices import samples_of
 from benchmarks.discretisation import BEAM, YOUNG
 from benchmarks.study import METHOD_COLOURS, OTHER_COLOURS, picture
-from dpl import Sample, Scene
+from dpl import Scene
 from dpl.evaluation import latency
 from dpl.fem import LinearSolver, Load, ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, solve
 from dpl.fem.linear import select_backend
@@ -40,10 +41,8 @@ def sizes(
 ) -> Iterator[list[Size]]:
     """Yield the costs of solvers and networks for each beam, measured in a separate process.
 
-    Args:
-        cells_across: Cells across each beam; there are four times as many along it.
-        memory_limit: Largest fully connected network that is built [GB].
-        loads: Number of timed loads.
+    A beam has four times as many cells along it as across. Fully connected networks above the
+    memory limit [GB] are not built.
     """
     context = multiprocessing.get_context("spawn")
     for cells in cells_across:
@@ -55,7 +54,7 @@ def _size(cells: int, memory_limit: float, loads: int) -> list[Size]:
     with one_thread(), torch.inference_mode():
         rows = list(_costs(cells, memory_limit, loads))
     peak_memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return [Size(r.case, r.dofs, r.ms, r.parameters, r.memory_mb, peak_memory_mb) for r in rows]
+    return [replace(row, peak_memory_mb=peak_memory_mb) for row in rows]
 
 
 def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
@@ -89,10 +88,7 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     yield row("Newton, corotational, from a guess with a relative error of 1e-3", hybrid)
     net = Unrolled(scene)
     surrogate = Surrogate(net, MSE(), scene).eval()
-    drawn = scene.loads.sample((0, 0), range(64))
-    linear = torch.stack([newton.linear_solver.solve(force) for force in drawn.force])
-    bent = linear + linear * linear.norm(dim=-1, keepdim=True)
-    samples = Sample(drawn.force, bent, drawn.young, drawn.parameters)
+    samples = samples_of(scene, 64)
     net.fit(samples, samples)
     kept = sum(t.nbytes for t in surrogate.state_dict().values()) + net.linear.blocks.values.nbytes
     yield row("unrolled", surrogate.predict, memory_mb=kept / 1e6)

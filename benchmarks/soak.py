@@ -22,7 +22,7 @@ from omegaconf import DictConfig
 
 from benchmarks import CONF
 from benchmarks.study import OTHER_COLOURS, picture, record
-from dpl import Scene, config
+from dpl import config
 from dpl.commands import cli
 from dpl.inference import Simulator
 
@@ -90,16 +90,16 @@ def simulator(sim: Simulator, seconds: float, *, every: float = 5.0) -> Iterator
     Network, tolerances, budgets, warm starts and invalid forces alternate. The loads repeat after
     `BATCH` times the number of calls.
     """
-    calls = list(_calls(sim))
-    newtons = _loads(sim.scene)
-    yield from _record("simulator", lambda k: calls[k % len(calls)](newtons(k)), seconds, every)
-
-
-def _loads(scene: Scene) -> Callable[[int], torch.Tensor]:
-    """Return a function of k to forces (N, D) [N]; every third one is twice as large."""
-    drawn = scene.loads.sample(STREAM, range(BATCH))
-    force = drawn.force * (drawn.young * scene.force_unit).view(-1, 1, 1)
-    return lambda k: force[k % BATCH] * (2.0 if k % 3 == 0 else 1.0)
+    calls, drawn = list(_calls(sim)), sim.scene.loads.sample(STREAM, range(BATCH))
+    newtons = drawn.force * (drawn.young * sim.scene.force_unit).view(-1, 1, 1)
+    start, next_record, steps = time.perf_counter(), 0.0, 0
+    while (now := time.perf_counter() - start) < seconds:
+        if now >= next_record:
+            yield usage("simulator", now, steps)
+            next_record = now + every
+        calls[steps % len(calls)](newtons[steps % BATCH] * (2.0 if steps % 3 == 0 else 1.0))
+        steps += 1
+    yield usage("simulator", time.perf_counter() - start, steps)
 
 
 def _calls(sim: Simulator) -> Iterator[Callable[[torch.Tensor], object]]:
@@ -125,20 +125,6 @@ def _calls(sim: Simulator) -> Iterator[Callable[[torch.Tensor], object]]:
         raise AssertionError("a force that is not finite was answered")
 
     yield refused
-
-
-def _record(
-    workload: str, step: Callable[[int], object], seconds: float, every: float
-) -> Iterator[Usage]:
-    start, next_record = time.perf_counter(), 0.0
-    steps = 0
-    while (now := time.perf_counter() - start) < seconds:
-        if now >= next_record:
-            yield usage(workload, now, steps)
-            next_record = now + every
-        step(steps)
-        steps += 1
-    yield usage(workload, time.perf_counter() - start, steps)
 
 
 class UsageMonitor(L.Callback):

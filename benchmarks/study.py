@@ -66,13 +66,8 @@ def record(
 ) -> list[Row]:
     """Write rows as CSV, each as soon as it is measured; print them; write machine and figure.
 
-    Args:
-        rows: Instances of one frozen dataclass, whose fields are the columns.
-        stem: Path of the files without extension.
-        title: Title of the printed table; None: the rows are not printed.
-        draw: Draws the rows to a path; None: there is no figure.
-        threads: Number of threads of the measurement, for the record.
-        facts: Further facts about the machine, for the record.
+    Rows are instances of one frozen dataclass, whose fields are the columns. Without a title they
+    are not printed. `stem` is the path of the files without extension.
     """
     measured: list[Row] = []
     for row in rows:
@@ -119,6 +114,15 @@ def picture(path: Path, height: float = 3.1) -> Iterator[Any]:
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = Image.open(drawn).convert("RGB").quantize(128)  # a third of the size
     palette.save(path, optimize=True)
+
+
+def label_decades(axis: Any, form: str = "{x:g}") -> None:
+    """Put labelled ticks at 1, 2 and 5 of each decade of an axis."""
+    from matplotlib.ticker import LogLocator
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(form)
+    axis.set_minor_formatter("")
 
 
 def dots(

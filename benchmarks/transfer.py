@@ -22,7 +22,7 @@ from dpl.evaluation.tables import share
 from dpl.inference import default_hybrid
 from dpl.inference.hybrid import Predict
 from dpl.system.threads import one_thread
-from dpl.training.metrics import median, relative_errors, signal_to_noise
+from dpl.training.metrics import errors_of
 
 
 @dataclass(frozen=True)
@@ -74,14 +74,13 @@ def measure(
     for family, test in tests.items():
         with one_thread(), torch.inference_mode():
             found = torch.cat([predict(load) for load in test.load.unbatch()])
-            errors = relative_errors(found, test)
             *_, solved = hybrid.iterate(test.load)
-        done = solved.converged
+        errors, done = errors_of(scene.problem, found, test), solved.converged
         yield Transfer(
-            *(network, trained_on, family, len(errors)),
-            rel_L2_median=float(median(errors)),
-            rel_L2_worst=float(errors.max()),
-            SNR_min=float(signal_to_noise(found, test).min()),
+            *(network, trained_on, family, len(done)),
+            rel_L2_median=errors["rel_L2_median"],
+            rel_L2_worst=errors["rel_L2_worst"],
+            SNR_min=errors["SNR_min"],
             converged=100 * float(done.double().mean()),
             hybrid_iterations=float(solved.iterations[done].double().mean()),
             newton_iterations=newton[family],

@@ -22,7 +22,6 @@ from dpl.training import (
     EnergyNormLoss,
     LossContext,
     LrPlus,
-    LrStar,
     PotentialEnergyLoss,
     Surrogate,
     fit,
@@ -266,7 +265,6 @@ def test_images_and_streams_carry_poissons_ratios(wide, sets, tmp_path):
 
 
 PHYSICS = {
-    "lr_star": lambda: LrStar(per_sample=True),
     "lr_plus": LrPlus,
     "stiffness": lambda: EnergyNormLoss(floor=0.0),
     "energy": lambda: PotentialEnergyLoss(floor=0.0),

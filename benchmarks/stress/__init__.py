@@ -34,7 +34,8 @@ from dpl.evaluation import tables
 def select_cases(wanted: Sequence[str] | None = None) -> list[Case]:
     """Return the cases of the mechanics and of predictors that stand for networks."""
     themes = loads, bodies, invalid_input, stability, networks
-    found = sorted((case for theme in themes for case in theme.cases()), key=_order)
+    every = [case for theme in themes for case in theme.cases()]
+    found = sorted(every, key=lambda case: int(case.name[1:]) if case.name != "sweep" else 99)
     known = names(found)
     if unknown := [name for name in wanted or () if name not in known]:
         raise ValueError(f"{unknown[0]!r} is none of {', '.join(known)}")
@@ -44,10 +45,6 @@ def select_cases(wanted: Sequence[str] | None = None) -> list[Case]:
 def names(cases: Sequence[Case]) -> list[str]:
     """Return the distinct names of cases."""
     return list(dict.fromkeys(case.name for case in cases))
-
-
-def _order(case: Case) -> int:
-    return int(case.name[1:]) if case.name[1:].isdigit() else 99
 
 
 KEYS = ((Sequence[str] | None, "cases"),)

@@ -22,12 +22,7 @@ class Auditor:
 
     Internal forces and min det F at the returned displacement are computed by tensor operations,
     not by the compiled loops that solvers use. Where a solution reports a tangent without negative
-    pivots, a direct factorisation counts them.
-
-    Attributes:
-        violations: Statements of solvers that are false, one line each.
-        solves, states_checked: Numbers of solves and of states that were checked.
-        min_detF: Smallest min det F of an accepted state [-].
+    pivots, a direct factorisation counts them. `violations` are false statements, one line each.
     """
 
     def __init__(self) -> None:
@@ -39,13 +34,10 @@ class Auditor:
     def wrap(
         self, solver: Solver, problem: Problem, tol: float, intermediate_tol: float = 1e-2
     ) -> "AuditedSolver":
-        """Return a solver whose states are checked.
+        """Return a solver whose states are checked; those with 0 iterations are starts.
 
-        Args:
-            solver: Any solver; its states with 0 iterations are starts, the others are accepted.
-            problem: The problem that is solved.
-            tol: Relative residual below which the solver reports convergence [-].
-            intermediate_tol: The same under a part of the load, where the solver ends with it.
+        It reports convergence below the relative residual `tol`, or `intermediate_tol` under a part
+        of the load.
         """
         return AuditedSolver(solver, problem, tol, intermediate_tol, self)
 

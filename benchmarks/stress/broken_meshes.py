@@ -79,11 +79,7 @@ BROKEN_MESHES: dict[str, tuple[str, Any, dict[str, Any]]] = {
         np.minimum(TWO_CUBES, 1),
         {"hexahedron": TWO_HEXES},
     ),
-    "flat tetrahedron": (
-        "no volume",
-        CORNERS,
-        {"tetra": np.concatenate([TETS, [[0, 1, 2, 3]]])},
-    ),
+    "flat tetrahedron": ("no volume", CORNERS, {"tetra": np.concatenate([TETS, [[0, 1, 2, 3]]])}),
     "flat triangle": ("no volume", with_node(PATCH, 4, [0.5, 0, 0]), {"triangle": FAN}),
     "crack": (
         "4 nodes coincide with others: 2 and 12, 5 and 15, 8 and 18, 11 and 21; merge them",

@@ -93,11 +93,8 @@ def classify(
 ) -> Outcome:
     """Return an outcome; it is silently wrong where a row misses its reference.
 
-    Args:
-        observed: Description of what happened.
-        rows: Numbers of solutions that are reported as valid.
-        failures: Deviations from the expectation that the solutions themselves report.
-        levels: Loads of a load sweep.
+    Rows are numbers of solutions that are reported as valid; failures are deviations from the
+    expectation that the solutions themselves report.
     """
     missed = [
         f"{row.quantity} is {row.value:.6g} and not {row.reference}"

@@ -1,12 +1,11 @@
 """Bodies and loads of the stress cases and of the tests of the mechanics."""
 
 import numpy as np
-import skfem
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.verification.bodies import Array, slender
+from benchmarks.verification.bodies import Array, paper_beam, slender
 from benchmarks.verification.rods import pushed
 from dpl import fem
 
@@ -29,18 +28,7 @@ def end_traction(problem: fem.Problem, q: float) -> Tensor:
 
 def coarse_beam(cell: str, degree: int, law: fem.Material) -> fem.Problem:
     """Return the paper's beam, 100 x 25 (x 25) m, with 8 x 2 (x 2) cells."""
-    flat = cell in ("triangle", "quad")
-    sizes, nodes = [100.0, 25.0, 25.0], [9, 3, 3]
-    mesh = fem.rectangle(sizes[:2], nodes[:2], cell) if flat else fem.box(sizes, nodes, cell)
-    return fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), degree=degree)
-
-
-def sliver_mesh(part: float) -> skfem.Mesh:
-    """Return the beam of 8 x 2 x 2 cells, its plane x = 50 m moved to 37.5 + 12.5 part."""
-    mesh = fem.box([100.0, 25.0, 25.0], [9, 3, 3])
-    points = mesh.p.copy()
-    points[0, points[0] == 50.0] = 37.5 + 12.5 * part
-    return skfem.MeshHex(points, mesh.t)
+    return paper_beam(law, (8, 2) if cell in ("triangle", "quad") else (8, 2, 2), cell, degree)
 
 
 def plate(
@@ -71,20 +59,6 @@ UNDERCONSTRAINED = {  # support -> region and the words of the error
     "free": (None, "6 rigid modes are unconstrained: translation along x"),
     "hinge": (fem.Box([0, 0, 0], [0, 1, 0]), "1 rigid modes are unconstrained: rotation about y"),
 }
-
-
-def underconstrained_bar(support: str) -> fem.Problem:
-    """Return a bar of 4 x 1 x 1 m with rigid-body modes, see `UNDERCONSTRAINED`."""
-    mesh = fem.box([4.0, 1.0, 1.0], [5, 2, 2])
-    return fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), fixed=UNDERCONSTRAINED[support][0])
-
-
-def folded_mesh() -> skfem.Mesh:
-    """Return a cube of 2 x 2 x 2 cells, its middle node moved outside; four cells are inverted."""
-    mesh = fem.box([1.0, 1.0, 1.0], [3, 3, 3])
-    points = mesh.p.copy()
-    points[:, (points == 0.5).all(axis=0)] = [[1.4], [0.5], [0.5]]
-    return skfem.MeshHex(points, mesh.t)
 
 
 def column(law: fem.Material, cells: tuple[int, int, int]) -> tuple[fem.Problem, Tensor]:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 import torch
-from torch import Tensor
 
 from benchmarks.stress.auditor import Auditor
 from benchmarks.stress.case import Case, LoadLevel, Outcome, classify
@@ -28,16 +27,8 @@ LARGE: list[tuple[str, fem.Material, float, str, str]] = [
 ]
 TOO_LARGE = (160.0, 400.0, 1000.0)  # T2: q [Pa] of SVK beyond the last valid equilibrium
 SMALL = (1e-2, 1e-4, 1e-6)  # T6: q [Pa]
-AMPLITUDES = (
-    1e-9,
-    1e-6,
-    1e-3,
-    0.1,
-    1.0,
-    4.0,
-    10.0,
-    25.0,
-)  # over the largest load of the training range
+# over the largest load of the training range
+AMPLITUDES = (1e-9, 1e-6, 1e-3, 0.1, 1.0, 4.0, 10.0, 25.0)
 
 
 def newton_variants(problem: fem.Problem) -> Iterator[tuple[str, fem.Newton]]:
@@ -151,16 +142,17 @@ def load_sweep(series: str, build: Callable[[], fem.Problem], auditor: Auditor) 
     unit, newton = end_traction(problem, MAX_TRACTION), fem.Newton(problem)
     levels, failures, rows = [], [], []
     for amplitude in AMPLITUDES:
-        state, min_detF = _solve_level(auditor, newton, amplitude * unit)
+        load = as_load(amplitude * unit)
+        states = list(auditor.wrap(newton, problem, newton.tol).iterate(load))
+        state, min_detF = states[-1], min(float(one.volume_ratio) for one in states)
         levels.append(level(series, amplitude, state, min_detF))
         if amplitude <= 1 and not state.converged.all():
             failures.append(f"{amplitude:g} of the range: {describe(state)}")
         if amplitude <= 1e-3 and state.converged.all():
-            linear = fem.solve(fem.LinearSolver(problem), as_load(amplitude * unit)).displacement
+            linear = fem.solve(fem.LinearSolver(problem), load).displacement
             apart = float((state.displacement - linear).norm() / linear.norm())
-            rows.append(
-                Row(f"{series}, {amplitude:g}: off linear", f"< {max(amplitude, 1e-6)}", apart)
-            )
+            bound = f"< {max(amplitude, 1e-6)}"
+            rows.append(Row(f"{series}, {amplitude:g}: off linear", bound, apart))
     beyond = [f"{r.amplitude:g}: {r.status} ({r.iterations})" for r in levels if r.amplitude > 1]
     return classify("in range all; " + ", ".join(beyond), rows, failures=failures, levels=levels)
 
@@ -173,38 +165,21 @@ def level(
     return LoadLevel(series, amplitude, float(state.residual), min_detF, iterations, status, error)
 
 
-def _solve_level(auditor: Auditor, newton: fem.Newton, force: Tensor) -> tuple[fem.Solution, float]:
-    """Return the solution under a force and the smallest min det F of all states."""
-    states = list(auditor.wrap(newton, newton.problem, newton.tol).iterate(as_load(force)))
-    return states[-1], min(float(state.volume_ratio) for state in states)
-
-
 def cases() -> list[Case]:
     """Return the cases of this module."""
     whole = "the answer to the whole load, stable, min J and deflection as printed"
     expect_error = "no valid equilibrium, with the part of the load that has one; not stored"
-    found = [
-        Case(
-            name,
-            f"{'SVK' if law is SVK else 'NH-ln'}, hex8 16 x 4 x 4, q = {q:g} Pa at once",
-            whole,
-            partial(large_load, law, q, volume, deepest),
-        )
-        for name, law, q, volume, deepest in LARGE
-    ]
-    found += [
-        Case(
-            "T2",
-            f"SVK, hex8 16 x 4 x 4, q = {q:g} Pa",
-            expect_error,
-            partial(load_without_equilibrium, q),
-        )
-        for q in TOO_LARGE
-    ]
+    found = []
+    for name, law, q, volume, deepest in LARGE:
+        run = partial(large_load, law, q, volume, deepest)
+        title = "SVK" if law is SVK else "NH-ln"
+        found.append(Case(name, f"{title}, hex8 16 x 4 x 4, q = {q:g} Pa at once", whole, run))
+    for q in TOO_LARGE:
+        run = partial(load_without_equilibrium, q)
+        found.append(Case("T2", f"SVK, hex8 16 x 4 x 4, q = {q:g} Pa", expect_error, run))
     kept = "accepted ones balanced, uninverted, stable; the others rejected with a reason"
-    found.append(
-        Case("T2", "data of SVK, loads up to 25 times the usual ones", kept, data_of_large_loads)
-    )
+    description = "data of SVK, loads up to 25 times the usual ones"
+    found.append(Case("T2", description, kept, data_of_large_loads))
     bent_beam = "w/L = .302130893; plain Newton takes load steps for it"
     found.append(Case("T5", "slender beam 20 x 1 x 1, NH-ln, PL^2/EI = 1", bent_beam, slender_beam))
     small = "u/q of the linear solution to 1e-6; no load: rest, 0 iterations"

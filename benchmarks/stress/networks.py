@@ -9,7 +9,7 @@ from torch import Tensor
 
 from benchmarks.plain_newton import PlainNewton
 from benchmarks.stress.auditor import Auditor
-from benchmarks.stress.case import Case, LoadLevel, Outcome, classify, expect_error
+from benchmarks.stress.case import Case, Outcome, classify, expect_error
 from benchmarks.stress.fixtures import MAX_TRACTION, YOUNG, as_load, end_traction
 from benchmarks.stress.loads import AMPLITUDES, describe, level
 from benchmarks.verification.bodies import paper_beam
@@ -24,11 +24,8 @@ SVK, NH = fem.SaintVenantKirchhoff(0.3), fem.NeoHookeanLn(0.3)
 INVALID = ("not a number", "one not a number", "infinite", "inverted")
 # T20: rms noise over L -> residual ratio of the prediction, plain iterations
 NOISE = {1e-2: ("592", "14"), 1e-3: ("53.6", "5"), 1e-4: ("5.47", "3"), 1e-5: (".534", "2")}
-REFERENCE_CORNER = {
-    1e-1: "8.96",
-    1e-2: ".818",
-    1e-3: ".081",
-}  # T21: error of a uniform factor -> ||R||/||f||
+# T21: error of a uniform factor -> ||R||/||f||
+REFERENCE_CORNER = {1e-1: "8.96", 1e-2: ".818", 1e-3: ".081"}
 FLOAT32 = 1.5e-4  # T18: residual ratio of an exact answer, rounded to float32, 1275 DOF
 
 
@@ -85,13 +82,11 @@ def invalid_prediction(name: str, auditor: Auditor) -> Outcome:
     for way, hybrid in hybrids(newton).items():
         state = auditor.solve(hybrid(guess), problem, load)
         same = torch.equal(state.displacement, classic.displacement)
+        more = float(state.iterations - classic.iterations)
         rows += [
             Row(f"{way}: Newton's solution, bit for bit", "1", float(same), 0),
             Row(f"{way}: prediction used", "0", float(state.from_guess), 0),
-            Row(
-                f"{way}: iterations more than Newton",
-                *("0", float(state.iterations - classic.iterations), 0),
-            ),
+            Row(f"{way}: iterations more than Newton", "0", more, 0),
         ]
     (alone,) = Direct(constant_prediction(guess), problem).iterate(load)
     rows.append(Row("network alone: converged", "0", float(alone.converged), 0))
@@ -142,14 +137,8 @@ def noisy_prediction(size: float, auditor: Auditor) -> Outcome:
         rows.append(Row(f"{way}: off Newton's answer, over L", "< 1e-8", off))
         if way == "paper":
             wanted = bool(alone.volume_ratio > 0) and float(alone.residual) < float(first.residual)
-            rows.append(
-                Row(
-                    "paper: prediction used",
-                    f"{int(wanted)}",
-                    float(prefer_prediction(*states[:2])),
-                    0,
-                )
-            )
+            used = float(prefer_prediction(*states[:2]))
+            rows.append(Row("paper: prediction used", f"{int(wanted)}", used, 0))
     taken = int(corrected.iterations)
     if taken > int(count) if size < 1e-2 else taken <= 6:  # at 1e-2 the draw decides how many
         failures.append(f"plain Newton takes {taken} iterations, printed {count}")
@@ -244,13 +233,10 @@ def load_sweep(auditor: Auditor) -> Outcome:
                 failures.append(f"{way}, {amplitude:g}: {describe(last)}")
             elif amplitude <= 1:
                 rows.append(Row(f"{way}, {amplitude:g}: off Newton", "< 1e-6", error))
-    return classify(_summary(levels), rows, failures=failures, levels=levels)
-
-
-def _summary(levels: list[LoadLevel]) -> str:
-    done = sum(level.status in ("converged", "unstable") for level in levels)
-    most = max(level.iterations for level in levels)
-    return f"{done} of {len(levels)} answered, at most {most} iterations"
+    done = sum(one.status in ("converged", "unstable") for one in levels)
+    most = max(one.iterations for one in levels)
+    said = f"{done} of {len(levels)} answered, at most {most} iterations"
+    return classify(said, rows, failures=failures, levels=levels)
 
 
 def too_large(auditor: Auditor) -> Outcome:
@@ -267,38 +253,28 @@ def too_large(auditor: Auditor) -> Outcome:
 
 def cases() -> list[Case]:
     """Return the cases of this module."""
-    floor = f"{FLOAT32:g} in float32; never converged; the hybrid exact to 1e-8 L"
-    found = [
-        Case("T18", "exact answer, rounded to float32 and bfloat16", floor, rounded_prediction)
-    ]
+    expected = f"{FLOAT32:g} in float32; never converged; the hybrid exact to 1e-8 L"
+    description = "exact answer, rounded to float32 and bfloat16"
+    found = [Case("T18", description, expected, rounded_prediction)]
     expected = "predictions and answers in float64, answers Newton's to 1e-6 L"
-    places = [("float32", torch.float32, "cpu"), ("bfloat16", torch.bfloat16, "cpu")]
-    if torch.cuda.is_available():
-        places.append(("float32 with TF32, on the GPU", torch.float32, "cuda"))
-    for name, dtype, device in places:
-        run = partial(_with_tf32 if device == "cuda" else network_precision, dtype, device)
+    for dtype in (torch.float32, torch.bfloat16):
+        name, run = str(dtype).removeprefix("torch."), partial(network_precision, dtype, "cpu")
         found.append(Case("T18", f"network in {name}", expected, run))
+    if torch.cuda.is_available():
+        found.append(Case("T18", "network in float32 with TF32, on the GPU", expected, _with_tf32))
     expected = "an error, or the answer of float64; none in float32"
     found.append(Case("T18", "Newton, given forces in float32", expected, float32_forces))
     for name in INVALID:
         expected = "Newton's solution bit for bit, with as many iterations; prediction not used"
         found.append(Case("T19", f"prediction {name}", expected, partial(invalid_prediction, name)))
     for name in ("huge", "minus", "half", "zero"):
-        found.append(
-            Case(
-                "T19",
-                f"prediction {name}",
-                "Newton's answer to 1e-8 L",
-                partial(poor_prediction, name),
-            )
-        )
+        run = partial(poor_prediction, name)
+        found.append(Case("T19", f"prediction {name}", "Newton's answer to 1e-8 L", run))
     for size, (printed, count) in NOISE.items():
         expected = f"|R|/|f| {printed}, {count} plain iterations; prediction used if below 95.6"
         found.append(Case("T20", f"noise of {size:g} L", expected, partial(noisy_prediction, size)))
-    expected = "|R|/|f| 8.96, .818, .081: none converged"
-    found.append(
-        Case("T21", "exact answer, 10 %, 1 %, 0.1 % too long", expected, scaled_prediction)
-    )
+    expected, description = "|R|/|f| 8.96, .818, .081: none converged", "10 %, 1 %, 0.1 % too long"
+    found.append(Case("T21", f"exact answer, {description}", expected, scaled_prediction))
     expected = "refused with its parameters, before any memory is taken"
     found.append(Case("T23", "the paper's network, 107,811 DOF, 128 GB", expected, too_large))
     expected = "Newton's answers in range; beyond, an answer or a status"
@@ -306,10 +282,10 @@ def cases() -> list[Case]:
     return [*found, Case("sweep", description, expected, load_sweep)]
 
 
-def _with_tf32(dtype: torch.dtype, device: str, auditor: Auditor) -> Outcome:
+def _with_tf32(auditor: Auditor) -> Outcome:
     before = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = True
     try:
-        return network_precision(dtype, device, auditor)
+        return network_precision(torch.float32, "cuda", auditor)
     finally:
         torch.backends.cuda.matmul.allow_tf32 = before

@@ -100,12 +100,6 @@ def _draw_beam(path: Path, curves: dict[str, Any], residuals: dict[bool, list[fl
         ax.legend(loc="upper right")
 
 
-def _rotation() -> Tensor:
-    """Return a rotation (3, 3) about an oblique axis."""
-    turn = torch.tensor([[0, -0.7, 0.4], [0.7, 0, -1.1], [-0.4, 1.1, 0]], dtype=torch.float64)
-    return torch.linalg.matrix_exp(turn)
-
-
 def balance(folder: Path) -> Section:
     """Check identities that every solution satisfies."""
     problem = paper_beam(NH, (8, 2, 2))
@@ -159,7 +153,8 @@ def balance(folder: Path) -> Section:
 
 def _invariance(problem: Problem, u: Tensor, force: Tensor) -> list[Row]:
     """Return balance of forces and moments, and objectivity."""
-    internal, X, Q = problem.internal_force(u), problem.points, _rotation()
+    turn = torch.tensor([[0, -0.7, 0.4], [0.7, 0, -1.1], [-0.4, 1.1, 0]], dtype=torch.float64)
+    internal, X, Q = problem.internal_force(u), problem.points, torch.linalg.matrix_exp(turn)
     reactions = torch.where(problem.free, 0.0, internal)
     forces = (reactions + force).sum(dim=(0, 1)).abs().max() / force.sum().abs()
     arms = torch.linalg.cross(X + u, internal)

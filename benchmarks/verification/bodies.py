@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem import Load, Material, Newton, Plane, Problem, Solution, Status, box
+from dpl.fem import Load, Material, Newton, Plane, Problem, Solution, Status, box, rectangle
 
 Array = NDArray[np.float64]
 
@@ -33,8 +33,9 @@ NAMES = {
 def paper_beam(
     law: Material, cells: Sequence[int], cell: str = "hexahedron", degree: int = 1
 ) -> Problem:
-    """Return the paper's beam, 100 x 25 x 25 m, fixed at x = 0."""
-    mesh = box([100.0, 25.0, 25.0], [n + 1 for n in cells], cell)
+    """Return the paper's beam, 100 x 25 (x 25) m, fixed at x = 0."""
+    build = box if len(cells) == 3 else rectangle
+    mesh = build([100.0, 25.0, 25.0][: len(cells)], [n + 1 for n in cells], cell)
     return Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
 
 

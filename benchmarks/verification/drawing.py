@@ -5,10 +5,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
-from benchmarks.verification.bodies import Array, lattice
-from dpl.fem import Problem
+from benchmarks.verification.bodies import Array
 from dpl.visualization import COLOURS
 
 MARKS = "osD^vP"
@@ -64,36 +62,6 @@ def side(ax: Any, places: Array, nodes: NDArray[np.int_], colour: str, step: int
     ax.fill(*outline.T, facecolor=colour, alpha=0.3, linewidth=0)
     lines = [*seen[::step], *seen.swapaxes(0, 1)[::step]]
     ax.add_collection(LineCollection(lines, colors=colour, linewidths=0.6))
-
-
-def solid(ax: Any, problem: Problem, displacement: Tensor, colour: str) -> None:
-    """Draw the faces of a block of a grid, deformed and lit, its cells outlined."""
-    from matplotlib.colors import to_rgb
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-
-    nodes = lattice(problem.points.numpy())
-    places = (problem.points + displacement).numpy()
-    light = np.array([-0.3, -0.85, 0.45])
-    for axis in range(3):
-        for end, outward in ((0, -1), (-1, 1)):
-            face = np.moveaxis(nodes, axis, 0)[end]
-            quad = np.stack([face[:-1, :-1], face[1:, :-1], face[1:, 1:], face[:-1, 1:]], axis=-1)
-            quads = places[quad.reshape(-1, 4)]
-            normals = np.cross(quads[:, 1] - quads[:, 0], quads[:, 3] - quads[:, 0])
-            normals *= outward * (1 if axis != 1 else -1) / np.linalg.norm(normals, axis=1)[:, None]
-            shade = 0.45 + 0.55 * np.maximum(normals @ light, 0.0)
-            colours = shade[:, None] * to_rgb(colour)
-            ax.add_collection3d(
-                Poly3DCollection(quads, facecolors=colours, edgecolors=colours, clip_on=False)
-            )
-            lines = [places[row] for row in (*face[:: problem.degree], *face.T[:: problem.degree])]
-            style = {"colors": "black", "linewidths": 0.25, "clip_on": False}
-            ax.add_collection3d(Line3DCollection(lines, **style))
-    low, high = places.min(axis=0), places.max(axis=0)
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    ax.set_box_aspect(high - low, zoom=1.45)
-    ax.view_init(elev=18, azim=-65)
-    ax.set_axis_off()
 
 
 def curve(ax: Any, x: Any, y: Any, label: str | None = None, linestyle: str = "-") -> None:

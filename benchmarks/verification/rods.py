@@ -52,11 +52,9 @@ Line = Callable[[float], tuple[float, Array, Array]]
 def bent_line(tip: float, count: int = 200) -> tuple[float, Array, Array]:
     """Return P L^2 / EI, line (count, 2) and slopes of an elastica under a dead load across it.
 
-    Source: Bisshopp, Drucker (1945), Quart. Appl. Math. 3.
+    `tip` is the slope there, in (0, pi/2) [rad].
 
-    Args:
-        tip: Slope at the tip, in (0, pi/2) [rad].
-        count: Points, from the clamp to the tip.
+    Source: Bisshopp, Drucker (1945), Quart. Appl. Math. 3.
     """
     m, sine = (1 + math.sin(tip)) / 2, math.sin(tip)
     slopes = tip * np.sin(np.linspace(0, math.pi / 2, count))
@@ -70,11 +68,9 @@ def bent_line(tip: float, count: int = 200) -> tuple[float, Array, Array]:
 def buckled_line(tip: float, count: int = 200) -> tuple[float, Array, Array]:
     """Return P over the critical load, line (count, 2) and slopes of an elastica pushed along it.
 
-    Source: Timoshenko, Gere (1961), Theory of Elastic Stability, section 2.7.
+    Points are at equal steps of length; `tip` is the slope there, in (0, pi) [rad].
 
-    Args:
-        tip: Slope at the tip, in (0, pi) [rad].
-        count: Points at equal steps of length, from the clamp to the tip.
+    Source: Timoshenko, Gere (1961), Theory of Elastic Stability, section 2.7.
     """
     k = math.sin(tip / 2)
     phase = np.linspace(0, math.pi / 2, 20 * count)

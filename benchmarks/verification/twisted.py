@@ -10,10 +10,10 @@ from torch import Tensor
 
 from benchmarks.study import picture
 from benchmarks.verification.bodies import Array, balanced
-from benchmarks.verification.drawing import curve, measured, panel, reference, solid
+from benchmarks.verification.drawing import curve, measured, panel, reference
 from benchmarks.verification.report import Row, Section
 from dpl.fem import DirichletBC, NeoHookeanLn, Newton, Plane, Problem, box
-from dpl.visualization import COLOURS
+from dpl.visualization import draw_body
 
 TWIST = {  # cells, degree: torque [N m], axial force [N], energy [J] at 90 degrees
     ((4, 4, 20), 1): ("18024.62786229", "-800.53818109", "14151.84978085"),
@@ -87,5 +87,5 @@ def _draw_twist(
             ax.legend(loc="upper left" if k == 0 else "lower left")
             ax.set_xticks([0, 30, 60, 90])
         ax = figure.add_subplot(1, 3, 3, projection="3d")
-        solid(ax, body, u, COLOURS[2])
+        draw_body(ax, body, u)
         ax.set_title("(c)", loc="left", y=1.1)

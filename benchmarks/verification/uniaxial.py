@@ -104,6 +104,9 @@ def laws(folder: Path) -> Section:
             )
         ]
         _draw_laws(panels, grid, curves)
+    at = int(np.abs(grid - 1.5).argmin())
+    stresses = [curves[name][at][0] for name in ("NH-ln", "NHiso-k2", "NHiso-k4", "SNH")]
+    spread = 100 * (max(stresses) / min(stresses) - 1)
     return Section(
         "Uniaxial stress",
         "closed forms",
@@ -111,16 +114,9 @@ def laws(folder: Path) -> Section:
         "shear moduli of 0.40 and 0.42 (Ogden), κ = 2.",
         rows,
         "The laws agree at small strains only. Two laws with the name neo-Hookean differ by "
-        f"{_spread(curves, grid):.0f} % at λ = 1.5, and SVK has no equilibrium above its largest "
+        f"{spread:.0f} % at λ = 1.5, and SVK has no equilibrium above its largest "
         "compressive stress, at λ = 1/√3.",
     )
-
-
-def _spread(curves: dict[str, list[tuple[float, float]]], grid: Array) -> float:
-    """Return by how much the stresses of the neo-Hookean laws differ at a stretch of 1.5 [%]."""
-    k = int(np.abs(grid - 1.5).argmin())
-    stress = [curves[name][k][0] for name in ("NH-ln", "NHiso-k2", "NHiso-k4", "SNH")]
-    return 100 * (max(stress) / min(stress) - 1)
 
 
 def _draw_laws(panels: Sequence[Any], grid: Array, curves: dict[str, Any]) -> None:

@@ -86,7 +86,8 @@ def depth_of(points: Array) -> Array:
 
 def endocardium(points: Array) -> NDArray[np.bool_]:
     """Return a mask of the nodes (N, 3) [mm] on the inner surface."""
-    return np.abs(_level(points, SHORT, LONG)) < ON_SURFACE
+    x, y, z = points.T
+    return np.abs((x**2 + y**2) / SHORT**2 + z**2 / LONG**2 - 1) < ON_SURFACE
 
 
 def apex(points: Array, depth: float) -> int:
@@ -95,28 +96,17 @@ def apex(points: Array, depth: float) -> int:
     return int(np.linalg.norm(points - place, axis=1).argmin())
 
 
-def _level(points: Array, short: float, long: float) -> Array:
-    x, y, z = points.T
-    return np.asarray((x**2 + y**2) / short**2 + z**2 / long**2 - 1)
-
-
 def _axes(depth: Array) -> tuple[Array, Array, Array]:
     """Return r_s [mm], r_l [mm] and the largest angle from the apex, u + pi [rad], at t."""
     short, long = SHORT + WALL * depth, LONG + WALL * depth
     return short, long, np.pi - np.arccos(BASE / long)
 
 
-def _polar(parameters: Array) -> tuple[Array, Array, Array]:
-    """Return the angles u + pi and v - pi [rad], and t, of parameters (3, N)."""
-    x, y, depth = parameters
-    disc = _disc(x, y)
-    return np.hypot(*disc) * _axes(depth)[2], np.arctan2(disc[1], disc[0]), depth
-
-
 def _placed(parameters: Array) -> Array:
     """Return the points (3, N) [mm] of parameters (3, N)."""
-    angle, v, depth = _polar(parameters)
-    short, long, _ = _axes(depth)
+    disc, depth = _disc(*parameters[:2]), parameters[2]
+    short, long, steepest = _axes(depth)
+    angle, v = np.hypot(*disc) * steepest, np.arctan2(disc[1], disc[0])  # u + pi and v - pi [rad]
     out = short * np.sin(angle)
     return np.stack([out * np.cos(v), out * np.sin(v), -long * np.cos(angle)])
 

@@ -36,15 +36,16 @@ def compare(folder: Path) -> None:
         FileNotFoundError: No run below the folder has been evaluated.
         ValueError: An evaluation has other rows.
     """
-    found = sorted(folder.rglob("evaluation.json"))
-    if not found:
+    if not (found := sorted(folder.rglob("evaluation.json"))):
         raise FileNotFoundError(f"{folder} contains no evaluated run")
     names = [str(path.parent.relative_to(folder)) for path in found]
     options = [config.options_of_run(path.parent) for path in found]
     numbers = [_numbers(path) for path in found]
     groups: dict[str, list[int]] = {}
-    for k, own in enumerate(options):
-        groups.setdefault(_group(names[k], own), []).append(k)
+    for k, (name, own) in enumerate(zip(names, options, strict=True)):
+        kept = {key: value for key, value in own.items() if not key.endswith("seed")}
+        key = json.dumps(kept, sort_keys=True, default=str) if kept else name
+        groups.setdefault(key, []).append(k)
     several = [members for members in groups.values() if len(members) > 1]
     results = [_cells(own) for own in numbers]
     results += [_cells(np.median([numbers[k] for k in some], axis=0).tolist()) for some in several]
@@ -92,12 +93,8 @@ def differing_options(
     """Return the values of the options in which runs differ, by the shortest unique ends of keys.
 
     The keys in the names of the runs, which are those of a sweep, come first. A key with the values
-    of another key, from which it is interpolated, and keys for which there is no room are left out.
-
-    Args:
-        names: Names of the runs.
-        options: Hyperparameters of each run; empty if they are unknown.
-        room: Characters of a line.
+    of another key, from which it is interpolated, and keys for which a line of `room` characters
+    has no place are left out. Options of a run are empty if they are unknown.
     """
     known = [one for one in options if one]
     shared = set.intersection(*(set(one) for one in known)) if known else set()
@@ -109,28 +106,14 @@ def differing_options(
         column = [_short(value, MAX_VALUE) for value in values[key]]
         if column in found.values():
             continue
-        name = _unique_end(key, differ)
+        parts, others = key.split("."), [f".{other}" for other in differ if other != key]
+        ends = (".".join(parts[start:]) for start in reversed(range(len(parts))))
+        unique = (end for end in ends if not any(o.endswith(f".{end}") for o in others))
+        name = next(unique, key)
         if (room := room - _width(name, *column)) < 0:
             break
         found[name] = column
     return found
-
-
-def _unique_end(key: str, keys: Sequence[str]) -> str:
-    """Return the last parts of a key, as many as no other key has."""
-    parts = key.split(".")
-    ends = (".".join(parts[start:]) for start in reversed(range(len(parts))))
-    others = [f".{other}" for other in keys if other != key]
-    return next((end for end in ends if not any(o.endswith(f".{end}") for o in others)), key)
-
-
-def _group(name: str, options: Mapping[str, Any]) -> str:
-    """Return a text that is equal for runs that differ only in seeds.
-
-    It contains the options of a run, or its name if these are unknown.
-    """
-    kept = {key: value for key, value in options.items() if not key.endswith("seed")}
-    return json.dumps(kept, sort_keys=True, default=str) if kept else name
 
 
 def _width(head: str, *cells: str) -> int:

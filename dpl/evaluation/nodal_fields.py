@@ -11,14 +11,8 @@ def nodal_fields(
 ) -> dict[str, Tensor]:
     """Return named fields at the nodes in SI units, (N, ...), for one load.
 
-    With a reference solution they contain its fields, whose names begin with "reference", and
+    Displacements are over L, (N, D) [-]. A reference solution adds its fields, "reference ...", and
     "error [m]", the distance between both positions of a node.
-
-    Args:
-        scene: The scene.
-        load: One load.
-        displacement: Over L, (N, D) [-].
-        reference: Displacement of the finite-element solution over L, (N, D) [-].
     """
     newton = "N" if scene.problem.shape[1] == 3 else "N/m"
     force = float(load.young) * scene.force_unit * load.force[0]

@@ -4,7 +4,6 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from dpl.evaluation.nodal_fields import nodal_fields
 from dpl.evaluation.tables import (
     PREDICTION,
     TOLS,
-    error_row,
     newton_row,
     percent,
     power,
@@ -38,7 +36,8 @@ from dpl.fem import (
 from dpl.inference import Answer, Corrected, Direct, Hybrid, Simulator
 from dpl.scene import Sample, Scene
 from dpl.system.threads import one_thread
-from dpl.training import ErrorMetrics, TrainedSurrogate, relative_errors
+from dpl.training import TrainedSurrogate, relative_errors
+from dpl.training.metrics import errors_of
 from dpl.visualization import plot_deformed
 
 ERRORS = (1e-3,)  # estimated relative errors of the simulator [-]
@@ -48,31 +47,20 @@ ONE_STEP = f"{PREDICTION}, 1 step"  # name of a row
 
 @dataclass(frozen=True)
 class SolverResult:
-    """Results of one solver for all loads.
+    """Results of one solver for all loads."""
 
-    Attributes:
-        solver: Name of the solver.
-        errors: The metrics of `dpl.training.metrics`.
-        converged: Number of loads that meet the tolerance and have no inverted element.
-        loads: Number of loads.
-        iterations: Mean number of linear solves.
-        max_iterations: Maximum number of linear solves.
-        ms: Median wall time of one load, with its residual and min det F [ms].
-        ms_p99: 99th percentile of this time [ms].
-        estimated_error: Median of the estimated relative error [-]: for predictions and the
-            simulator that of `Answer`, else that of `estimate_error`; infinite: not computed.
-        latency: Latency of `sim(force)` and of the bare network; empty for other solvers.
-    """
-
-    solver: str
-    errors: dict[str, float]
-    converged: int
-    loads: int
-    iterations: float
-    max_iterations: int
-    ms: float
-    ms_p99: float
+    solver: str  # name of the solver
+    errors: dict[str, float]  # the metrics of `dpl.training.metrics`
+    converged: int  # number of loads that meet the tolerance and have no inverted element
+    loads: int  # number of loads
+    iterations: float  # mean number of linear solves
+    max_iterations: int  # maximum number of linear solves
+    ms: float  # median wall time of one load, with its residual and min det F [ms]
+    ms_p99: float  # 99th percentile of this time [ms]
+    # median of the estimated relative error [-]: for predictions and the simulator that of
+    # `Answer`, else that of `estimate_error`; infinite: not computed
     estimated_error: float = math.inf
+    # latency of `sim(force)` and of the bare network; empty for other solvers
     latency: Mapping[str, Latency] = field(default_factory=dict)
 
 
@@ -85,9 +73,7 @@ def measure(
     """
     timed, rows = time_interleaved(solvers, batch.load), []
     for name, (solution, times) in timed.items():
-        errors = ErrorMetrics(problem)
-        errors.update(solution.displacement, batch)
-        numbers = {key: float(value) for key, value in errors.compute().items()}
+        numbers = errors_of(problem, solution.displacement, batch)
         iterations = solution.iterations.double()
         counts = int(solution.converged.sum()), len(solution.converged)
         steps = float(iterations.mean()), int(iterations.max())
@@ -143,22 +129,27 @@ def evaluate(
     """
     scene, simulator = surrogate.scene, Simulator(surrogate)
     tight, linear = min(tols), _own(scene).linear_solver
-    simulated = {error_row(error): _Simulated(simulator, {"error": error}) for error in errors}
+    simulated = {
+        f"sim(force, error={power(error)})": _Simulated(simulator, {"error": error})
+        for error in errors
+    }
     simulated |= {simulator_row(tol): _Simulated(simulator, {"tol": tol}) for tol in tols}
     solvers: dict[str, Solver] = {
         "linear": replace(linear, tol=tight, parent=linear),  # with its factor
         PREDICTION: Direct(surrogate.predict, scene.problem, tight),
-        **_step_in_modes(surrogate, tight),
-        f"paper's hybrid to {power(tight)}": Hybrid(
-            surrogate.predict, replace(_own(scene), tol=tight), "paper"
-        ),
-        **simulated,
-        **{newton_row(tol): replace(_own(scene), tol=tol) for tol in tols},
     }
+    if (within := surrogate.predictor.correction()) is not None:
+        one = replace(within, tol=tight, max_iter=1, error_tol=LEAST_ERROR)
+        one.tangent  # noqa: B018  # built here, so that the first call is not slower
+        solvers[ONE_STEP] = Corrected(surrogate.predict, one)
+    newton = _own(scene)
+    paper = Hybrid(surrogate.predict, replace(newton, tol=tight), "paper")
+    solvers |= {f"paper's hybrid to {power(tight)}": paper, **simulated}
+    solvers |= {newton_row(tol): replace(newton, tol=tol) for tol in tols}
     with one_thread():
         rows, displacements = measure(solvers, test, scene.problem)
         estimates: dict[str, Callable[[Load, Tensor], float]]
-        estimates = dict.fromkeys(solvers, partial(_estimated, scene.linear))
+        estimates = dict.fromkeys(solvers, lambda *a: estimate_error(scene.linear, *a).error)
         estimates |= {name: solver.error for name, solver in simulated.items()}
         estimates |= dict.fromkeys((PREDICTION, ONE_STEP), simulator.prediction_error)
         medians = {
@@ -176,24 +167,15 @@ def evaluate(
     return rows
 
 
-def _estimated(linear: LinearSolver, load: Load, displacement: Tensor) -> float:
-    """Return the estimated relative error of a displacement (1, N, D) [-]."""
-    return estimate_error(linear, load, displacement).error
-
-
 @dataclass(frozen=True)
 class _Simulated:
     """The simulator with a tolerance, as a solver.
 
     A load has converged if it meets the tolerance, be it of the residual or of the estimated error.
-
-    Attributes:
-        simulator: The simulator.
-        tolerance: `tol` or `error` of a call [-].
     """
 
     simulator: Simulator
-    tolerance: Mapping[str, float]
+    tolerance: Mapping[str, float]  # `tol` or `error` of a call [-]
 
     def answer(self, load: Load) -> Answer:
         """Return the answer of the simulator."""
@@ -224,16 +206,6 @@ class _Simulated:
             seconds=answer.milliseconds / 1e3,
             from_guess=count.bool(),
         )
-
-
-def _step_in_modes(surrogate: TrainedSurrogate, tol: float) -> dict[str, Solver]:
-    """Return the surrogate with one Newton step in its modes, if it has such a method."""
-    newton = surrogate.predictor.correction()
-    if newton is None:
-        return {}
-    one = replace(newton, tol=tol, max_iter=1, error_tol=LEAST_ERROR)
-    one.tangent  # noqa: B018  # built here, so that the first call is not slower
-    return {ONE_STEP: Corrected(surrogate.predict, one)}
 
 
 def _own(scene: Scene) -> Newton:

@@ -71,11 +71,6 @@ def simulator_row(tol: float) -> str:
     return f"sim(force, tol={power(tol)})"
 
 
-def error_row(error: float) -> str:
-    """Return the name of the row of the simulator with a tolerance for the estimated error."""
-    return f"sim(force, error={power(error)})"
-
-
 def newton_row(tol: float) -> str:
     """Return the name of the row of Newton's method from rest to a tolerance."""
     return f"Newton, tol={power(tol)}"

@@ -21,20 +21,13 @@ WARM_UP = 5  # loads solved before the clock starts
 
 @dataclass(frozen=True)
 class Latency:
-    """Wall time of one call, one load at a time on one thread.
+    """Wall time of one call, one load at a time on one thread."""
 
-    Attributes:
-        loads: Number of different loads.
-        p50: Median [ms].
-        p99: 99th percentile [ms].
-    """
-
-    loads: int
-    p50: float
-    p99: float
+    loads: int  # number of different loads
+    p50: float  # median [ms]
+    p99: float  # 99th percentile [ms]
 
     def __str__(self) -> str:
-        """Return both percentiles as text."""
         p50, p99 = (f"{float(f'{ms:.2g}'):g}" for ms in (self.p50, self.p99))
         return f"p50 {p50} ms, p99 {p99} ms"
 

@@ -52,13 +52,17 @@ def read(path: Path) -> dict[str, Any]:
 
     Raises:
         ValueError: The file is damaged, no checkpoint, or compressed.
-        OSError: The file cannot be opened.
     """
     if (size := path.stat().st_size) > MAX_BYTES:
         raise ValueError(f"has {size / 1e9:.3g} GB; the maximum is {MAX_BYTES / 1e9:g} GB")
     try:
         if path.suffix == WEIGHTS:
-            return _weights(path)
+            with safe_open(path, framework="pt") as file:
+                header = json.loads((file.metadata() or {}).get("dpl", "null"))
+                if not isinstance(header, dict):
+                    raise ValueError("its header contains no scene")
+                state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return {name: header[name] for name in HEADER if name in header} | {"state_dict": state}
         with zipfile.ZipFile(path) as archive:  # torch does not compress
             unpacked = sum(member.file_size for member in archive.infolist())
         if unpacked > size:
@@ -94,11 +98,7 @@ def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
 
 
 def epochs(checkpoint: Mapping[str, Any]) -> int:
-    """Return the number of epochs before a checkpoint was written.
-
-    Raises:
-        ValueError: The checkpoint lacks data for resuming.
-    """
+    """Return the number of epochs before a checkpoint that can be resumed was written."""
     if missing := RESUME_KEYS - checkpoint.keys():
         raise ValueError(
             f"cannot be resumed: it contains no {', '.join(sorted(missing))}; resume from last.ckpt"
@@ -128,12 +128,3 @@ def set_random_states(states: dict[str, Any]) -> None:
     np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))  # noqa: NPY002
     version, numbers, gauss = states["python"]
     random.setstate((version, tuple(numbers), gauss))
-
-
-def _weights(path: Path) -> dict[str, Any]:
-    with safe_open(path, framework="pt") as file:
-        header = json.loads((file.metadata() or {}).get("dpl", "null"))
-        if not isinstance(header, dict):
-            raise ValueError("is not a checkpoint: its header contains no scene")
-        state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    return {**{name: header[name] for name in HEADER if name in header}, "state_dict": state}

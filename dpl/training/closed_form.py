@@ -54,12 +54,8 @@ def fit(
 
     Returns:
         The smallest e_mean of the fits on the validation samples [-]; infinite if no error is
-        finite.
-
-    Raises:
-        DataSetError: The folder of the data holds something else, or another process writes there.
-        KeyboardInterrupt: The training was interrupted; solved loads and checkpoints are kept.
-        SystemExit: After SIGTERM, with status 143.
+        finite. After an interruption solved loads and checkpoints are kept; SIGTERM raises
+        SystemExit with status 143.
     """
     net = cast(ClosedFormFit, surrogate.cpu().net)
     loggers, callbacks = (trainer.loggers, trainer.callbacks) if trainer else ([], [])

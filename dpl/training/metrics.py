@@ -26,15 +26,6 @@ def median(values: Tensor) -> Tensor:
     return (values.median(dim=0).values - (-values).median(dim=0).values) / 2
 
 
-def mean_errors(prediction: Tensor, batch: Sample) -> Tensor:
-    """Return ||u - v|| over the number of degrees of freedom, (B,) [-].
-
-    It decreases like the inverse root of that number under refinement and must not be compared
-    across meshes.
-    """
-    return _norm(prediction - batch.displacement) / prediction[0].numel()
-
-
 def relative_errors(prediction: Tensor, batch: Sample) -> Tensor:
     """Return ||u - v|| / ||v||, (B,) [-], of displacements u, (B, N, D)."""
     return _norm(prediction - batch.displacement) / _norm(batch.displacement)
@@ -45,12 +36,8 @@ def largest_errors(prediction: Tensor, batch: Sample) -> Tensor:
     return (prediction - batch.displacement).norm(dim=2).amax(dim=1)
 
 
-def signal_to_noise(prediction: Tensor, batch: Sample) -> Tensor:
-    """Return 20 log10(||u|| / ||u - v||), (B,) [dB], of displacements u, (B, N, D)."""
-    return 20 * (_norm(prediction) / _norm(prediction - batch.displacement)).log10()
-
-
 METRICS: dict[str, tuple[int, Callable[[Tensor], Tensor]]] = {  # column of a load, reduction
+    # It decreases like the inverse root of the number of degrees of freedom under refinement.
     "e_mean": (0, torch.mean),
     "e_max": (1, torch.max),
     "SNR_min": (2, torch.min),
@@ -66,10 +53,8 @@ METRICS: dict[str, tuple[int, Callable[[Tensor], Tensor]]] = {  # column of a lo
 class ErrorMetrics(Metric):
     """The errors `METRICS` of predictions, by name.
 
-    It is updated with (prediction, batch): displacements over L, (B, N, D), and a `Sample`.
-
-    Attributes:
-        problem: The finite-element problem, on the device of the predictions.
+    It is updated with (prediction, batch): displacements over L, (B, N, D), and a `Sample`, on the
+    device of its `problem`.
     """
 
     full_state_update = False
@@ -86,10 +71,11 @@ class ErrorMetrics(Metric):
         u, problem = prediction.double(), self.problem.with_parameters(batch.parameters)
         internal, volume_ratio = problem.evaluate(u)
         residual = problem.relative_residual_of(internal, batch.force)
+        error = _norm(u - batch.displacement)
         columns = (
-            mean_errors(u, batch),
+            error / u[0].numel(),
             largest_errors(u, batch),
-            signal_to_noise(u, batch),
+            20 * (_norm(u) / error).log10(),
             relative_errors(u, batch),
             torch.nan_to_num(residual, nan=torch.inf),
             volume_ratio,
@@ -102,22 +88,23 @@ class ErrorMetrics(Metric):
         return {name: reduce(values[:, column]) for name, (column, reduce) in METRICS.items()}
 
 
+def errors_of(problem: Problem, prediction: Tensor, batch: Sample) -> dict[str, float]:
+    """Return the metrics of displacements over L, (B, N, D), by name."""
+    metrics = ErrorMetrics(problem)
+    metrics.update(prediction, batch)
+    return {name: float(value) for name, value in metrics.compute().items()}
+
+
 def _norm(field: Tensor) -> Tensor:
     return field.flatten(1).norm(dim=1)
 
 
 class PerLoadErrors(NamedTuple):
-    """Errors of the predictions for some loads.
+    """Errors of the predictions for some loads, (B,) each [-]."""
 
-    Attributes:
-        relative: Relative L2 errors, (B,) [-].
-        largest: Largest nodal errors over L, (B,) [-].
-        size: Largest nodal displacements of the reference over L, (B,) [-].
-    """
-
-    relative: Tensor
-    largest: Tensor
-    size: Tensor
+    relative: Tensor  # relative L2 errors
+    largest: Tensor  # largest nodal errors over L
+    size: Tensor  # largest nodal displacements of the reference over L
 
     def select(self, count: int) -> list[int]:
         """Return the loads to draw: 2 `count` with large errors and a typical one.
@@ -130,11 +117,6 @@ class PerLoadErrors(NamedTuple):
         selected += [load for load in largest if load not in selected][:count]
         others = [load for load in relative if load not in selected]
         return [*selected, *others[len(others) // 2 :][:1]]
-
-    @property
-    def largest_absolute(self) -> int:
-        """The load with the largest absolute error."""
-        return self._order(self.largest)[0]
 
     def title(self, load: int) -> str:
         """Return the caption of a load: its errors and their ranks."""

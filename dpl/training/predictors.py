@@ -31,24 +31,15 @@ SCALES = ("force_scale", "displacement_scale")
 class Predictor(StoredBuffers):
     """A function of loads that returns displacements over L, (B, N, D) [-], float64.
 
-    Subclasses define `forward(load)`.
-
-    Attributes:
-        net: The network.
-        scene: The scene.
-        problem: The finite-element problem of the scene, on the device of the network.
-        force_scale: Root mean square of forces, () [-].
-        displacement_scale: Root mean square of displacements, () [-].
-        reads_young: True if Young's modulus is an input of the network.
-        is_closed_form: True for a model that `dpl.training.fit` fits, without gradient descent.
-        meaning: Formula of the displacement, for a program that reads an exported surrogate.
+    Subclasses define `forward(load)`. `problem` is that of the scene on the device of the network.
     """
 
-    meaning: ClassVar[str]
-    is_closed_form: ClassVar[bool] = False
-    reads_young = False
-    force_scale: Tensor
-    displacement_scale: Tensor
+    meaning: ClassVar[str]  # formula, for a program that reads an exported surrogate
+    saves: ClassVar[tuple[str, ...]] = ()  # work that the predictor saves, one line each
+    is_closed_form: ClassVar[bool] = False  # `dpl.training.fit` fits it, no gradient descent
+    reads_young = False  # Young's modulus is an input of the network
+    force_scale: Tensor  # root mean square of forces, () [-]
+    displacement_scale: Tensor  # root mean square of displacements, () [-]
 
     def __init__(self, net: nn.Module, scene: Scene, *scales: Tensor) -> None:
         """Store network, scene and `SCALES`; they are 1 by default."""
@@ -62,12 +53,7 @@ class Predictor(StoredBuffers):
         return self(batch.load), batch
 
     def dataset(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
-        """Return the training set: samples and their images.
-
-        Args:
-            samples: The samples, (S, N, D).
-            group: Symmetries of the body whose images of samples are wanted; empty for none.
-        """
+        """Return the training set: samples (S, N, D) and their images under a group."""
         return Samples(samples, group)
 
     def examples(self, samples: Sample) -> tuple[Tensor, Tensor]:
@@ -89,12 +75,7 @@ class Predictor(StoredBuffers):
         cast(HasBases, self.net).fit_bases(*fields)
 
     def scalars(self, load: Load, *computed: Tensor) -> Tensor:
-        """Return the scalars of loads, (B, S), in the dtype of the network.
-
-        Args:
-            load: The loads.
-            computed: Scalars before the ranges of the body, (B,) each.
-        """
+        """Return `computed` (B,) and the ranges of the body, (B, S), in the network's dtype."""
         ranges, parameters = self.scene.loads.parameter_ranges, self.parameters_of(load)
         pairs = zip(ranges.values(), parameters.unbind(-1), strict=True)
         columns = [*computed, *(ends.normalise(column) for ends, column in pairs)]
@@ -103,11 +84,7 @@ class Predictor(StoredBuffers):
         return torch.stack([column.to(self.dtype) for column in columns], dim=1)
 
     def parameters_of(self, load: Load) -> Tensor:
-        """Return the values of the ranges of the body, (B, P).
-
-        Raises:
-            ValueError: The load has not one parameter for each range of the body.
-        """
+        """Return the values of the ranges of the body, (B, P); raise ValueError if some lack."""
         names = list(self.scene.loads.parameter_ranges)
         if (found := load.parameters.shape[-1]) != len(names):
             raise ValueError(f"Load.parameters has {found} columns; the body has ranges of {names}")
@@ -120,8 +97,8 @@ class Predictor(StoredBuffers):
 
     def correction(self) -> SubspaceNewton | None:
         """Return Newton's method in the modes of a network that `HasCorrection`, else None."""
-        own = hasattr(self.net, "correction")
-        return cast(HasCorrection, self.net).correction() if own else None
+        net = cast(HasCorrection, self.net)
+        return net.correction() if hasattr(net, "correction") else None
 
     def describe(self, loss: "Loss") -> str:
         """Return name and size of the network, and the loss."""
@@ -129,8 +106,8 @@ class Predictor(StoredBuffers):
         return f"{type(self.net).__name__}, {count:,} weights; loss {type(loss).__name__}"
 
     def skipped_work(self, loss: "Loss") -> list[str]:
-        """Return the work that network and loss save, one line each."""
-        return [*getattr(self.net, "skipped_work", list)(), *loss.skipped_work()]
+        """Return the work that network, loss and predictor save, one line each."""
+        return [*getattr(self.net, "skipped_work", list)(), *loss.skipped_work(), *self.saves]
 
     def check_buffers(self) -> None:
         """Raise ValueError if a scale is not positive."""
@@ -208,10 +185,6 @@ class OnLinearSolution(Predictor):
     as fast as v at large ones; the gate a^2 / (1 + a) does both. The outputs that are wanted are
     therefore of order one for all loads, and the prediction of a small load is the linear
     solution. v determines the load, so that it replaces the force as the input of the network.
-
-    Attributes:
-        base: Function of loads that returns v.
-        whiten: W, a function of fields (B, N, D).
     """
 
     meaning = (
@@ -219,13 +192,10 @@ class OnLinearSolution(Predictor):
         "v/rms(v) and a; network; displacement = length (v + scales.displacement a^2 / (1 + a) "
         "output)"
     )
+    saves = ("no learning of linear elasticity: the network adds to K(0)^-1 f",)
 
     def __init__(self, net: nn.Module, scene: Scene) -> None:
-        """Compute the scales and the whitening.
-
-        Args:
-            net: The network, built with `Inputs.from_scene(scene, "linear")`.
-            scene: The scene.
+        """Compute scales and whitening; `net` is built with `Inputs.from_scene(scene, "linear")`.
 
         Raises:
             ValueError: K(0) changes too much with the parameters.
@@ -236,12 +206,7 @@ class OnLinearSolution(Predictor):
         self.whiten = FieldWhitening(self.normalise(linear)[0], scene.problem.free)
 
     def forward(self, load: Load, linear: Tensor | None = None) -> Tensor:
-        """Return displacements over L, (B, N, D) [-], in the precision of the forces.
-
-        Args:
-            load: The loads.
-            linear: Their linear solutions, (B, N, D) [-], if they are known.
-        """
+        """Return displacements over L, (B, N, D), of loads; `linear`: the solutions if known."""
         linear = self.base.solve(load) if linear is None else linear.to(load.force.dtype)
         field, amplitude = self.normalise(linear)
         scalars = self.scalars(load, 2 * amplitude / (1 + amplitude) - 1)
@@ -264,9 +229,7 @@ class OnLinearSolution(Predictor):
 
     def predict_batch(self, batch: tuple[Tensor, Sample] | Sample) -> tuple[Tensor, Sample]:
         """Return the displacements of a batch; batches of a stream have no linear solutions."""
-        if isinstance(batch, Sample):
-            return self(batch.load), batch
-        linear, sample = batch
+        linear, sample = (None, batch) if isinstance(batch, Sample) else batch
         return self(sample.load, linear), sample
 
     def dataset(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
@@ -280,11 +243,6 @@ class OnLinearSolution(Predictor):
         missed = torch.where(self.problem.free, samples.displacement - linear, 0.0)
         gate = self._gate(amplitude)
         return self.whiten(field), missed / torch.where(gate > 0, gate, 1.0)
-
-    def skipped_work(self, loss: "Loss") -> list[str]:
-        """Return the work that network, base and loss save, one line each."""
-        line = "no learning of linear elasticity: the network adds to K(0)^-1 f"
-        return [*super().skipped_work(loss), line]
 
 
 class Fitted(Predictor):
@@ -332,13 +290,7 @@ def linear_solutions(load: Load, base: LinearBase) -> Tensor:
 def predictor_of(
     net: nn.Module, scene: Scene, base: Base | None = None, *, young: bool = False
 ) -> Predictor:
-    """Return the predictor of a network, or of a model that is fitted (it defines `fit`).
-
-    A fitted model has no base beside its own.
-
-    Raises:
-        ValueError: There is no such base, or it excludes another option.
-    """
+    """Return the predictor of a network, or of a model that is fitted (it defines `fit`)."""
     Inputs.from_scene(scene, base, young=young)  # checks the options
     if hasattr(net, "fit"):
         return Fitted(net, scene)
@@ -346,15 +298,9 @@ def predictor_of(
 
 
 def scales(scene: Scene, force: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the scales of forces and displacements, scalars [-].
+    """Return the root mean squares of forces and displacements (S, N, D), () [-] each.
 
-    They are root mean squares: of forces over loadable degrees of freedom, of displacements over
-    free degrees of freedom.
-
-    Args:
-        scene: The scene.
-        force: Forces of random loads, (S, N, D) [-].
-        displacement: Their linear solutions, (S, N, D) [-].
+    They are those of loadable degrees of freedom (forces) and of free ones (displacements).
     """
     force = force[:, scene.loads.loadable_dofs]
     displacement = displacement[:, scene.problem.free]

@@ -45,15 +45,3 @@ def time_fraction(trainer: L.Trainer) -> float:
             part = elapsed / max(elapsed + remaining, 1e-9)
             return float(trainer.strategy.broadcast(part))
     return 0.0
-
-
-def step_in_time(schedule: torch.optim.lr_scheduler.LambdaLR, steps: int, fraction: float) -> None:
-    """Make the next step of a schedule, or a larger one if the time limit is nearer than the end.
-
-    Args:
-        schedule: The schedule, a function of the number of the step.
-        steps: Number of steps in the schedule.
-        fraction: Elapsed part of the time limit.
-    """
-    schedule.last_epoch = max(schedule.last_epoch, math.floor(fraction * steps) - 1)
-    schedule.step()

@@ -1,5 +1,6 @@
 """The LightningModule: a surrogate with loss, metrics and optimiser."""
 
+import math
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, Self
 
@@ -15,16 +16,12 @@ from dpl.training import checkpoints
 from dpl.training.callbacks.averaged_weights import AveragedWeights
 from dpl.training.losses.loss import Loss, LossContext
 from dpl.training.metrics import ErrorMetrics
-from dpl.training.schedules import step_in_time, time_fraction, total_steps
+from dpl.training.schedules import time_fraction, total_steps
 from dpl.training.trained import TrainedSurrogate
 
 
 class Surrogate(TrainedSurrogate, L.LightningModule):
-    """A network that predicts the displacement in equilibrium with a load, with its training.
-
-    Attributes:
-        loss: The loss.
-    """
+    """A network that predicts the displacement in equilibrium with a load, with its training."""
 
     if TYPE_CHECKING:  # type checkers do not follow Lightning
 
@@ -57,9 +54,6 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
                 schedule, stepped every batch; None for a constant learning rate. With a time limit
                 of the trainer a `LambdaLR` is a function of max(step / total_steps, elapsed part
                 of the time).
-
-        Raises:
-            ValueError: There is no such base, or it excludes the network or another option.
         """
         super().__init__(net, scene, base=base, young=young)
         self.loss = loss
@@ -177,12 +171,15 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": schedule}
 
     def lr_scheduler_step(self, scheduler: Any, metric: Any | None) -> None:
-        """Make a step of the schedule; functions of the step follow a time limit of the trainer."""
+        """Make a step of the schedule.
+
+        A function of the step advances further if the time limit is nearer than the last step.
+        """
         fraction = time_fraction(self.trainer)
         if fraction and isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR):
-            step_in_time(scheduler, total_steps(self.trainer), fraction)
-        else:
-            super().lr_scheduler_step(scheduler, metric)
+            reached = math.floor(fraction * total_steps(self.trainer)) - 1
+            scheduler.last_epoch = max(scheduler.last_epoch, reached)
+        super().lr_scheduler_step(scheduler, metric)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the scene, the states of random number generators and averaged weights."""
@@ -192,7 +189,7 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         # not a hook of the callback: Lightning calls those only for complete checkpoints
         for callback in self._trainer.callbacks if self._trainer else ():
             if isinstance(callback, AveragedWeights):
-                callback.replace_weights(checkpoint)
+                checkpoint["state_dict"] = {**checkpoint["state_dict"], **callback.average}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Raise ValueError if the checkpoint belongs to another scene."""

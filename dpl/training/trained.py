@@ -18,15 +18,11 @@ from dpl.training.predictors import predictor_of
 class TrainedSurrogate(nn.Module):
     """A network that predicts the displacement in equilibrium with a load.
 
-    `forward` takes newtons and pascals and returns metres; `predict` is dimensionless.
-
-    Attributes:
-        predictor: The network with its scales, perhaps on the linear solution, see `Predictor`.
-        scene: The scene.
-        largest_force: Norm of the largest force of the loads, () [-].
+    `forward` takes newtons and pascals and returns metres; `predict` is dimensionless. `predictor`
+    is the network with its scales, perhaps on the linear solution.
     """
 
-    largest_force: Tensor
+    largest_force: Tensor  # norm of the largest force of the loads, () [-]
 
     def __init__(
         self, net: nn.Module, scene: Scene, *, base: Base | None = None, young: bool = False
@@ -68,12 +64,7 @@ class TrainedSurrogate(nn.Module):
         return cast(HasCorrection, self.net).forward_with_errors(load.force, parameters)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
-        """Load weights; the arguments are those of `torch.nn.Module`.
-
-        Raises:
-            ValueError: A tensor has another type, is not finite, or is none that a fit can give.
-            RuntimeError: The weights are of another network.
-        """
+        """Load weights; raise ValueError for another type, and for values that no fit can give."""
         own = self.state_dict()
         for name, stored in state_dict.items():
             dtype = own[name].dtype if name in own else stored.dtype

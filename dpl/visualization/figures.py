@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem import Problem, surface
-from dpl.visualization.shapes import error_scale
 from dpl.visualization.style import DPI
 
 if TYPE_CHECKING:
@@ -40,52 +38,38 @@ def draw_body(
             have the same scale.
     """
     from matplotlib.cm import ScalarMappable
+    from matplotlib.collections import PolyCollection
     from matplotlib.colors import Normalize
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
     deformed = [points + u.detach().cpu().numpy() for u in (displacement, *fit) if u is not None]
-    shape = points if displacement is None else deformed[0]
+    corners: Any = (points if displacement is None else deformed[0])[polygons]
     nodal = np.zeros(len(points)) if values is None else values.detach().cpu().numpy()
     scale = ScalarMappable(Normalize(*(limits or (nodal.min(), nodal.max()))), colours)
     faces: Any = "0.85" if values is None else scale.to_rgba(nodal[polygons].mean(axis=1))
-    _draw(ax, shape[polygons], facecolors=faces, edgecolors="0.3", linewidths=0.2)
-    _set_extent(ax, np.stack([points, *deformed]), zoom=1.0)
-    return scale
-
-
-def _draw(ax: Any, polygons: Any, **style: Any) -> None:
-    from matplotlib.collections import PolyCollection
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
-    if polygons.shape[-1] == 3:
-        ax.add_collection3d(Poly3DCollection(polygons, clip_on=False, **style))
+    style: dict[str, Any] = {"facecolors": faces, "edgecolors": "0.3", "linewidths": 0.2}
+    if points.shape[1] == 3:
+        ax.add_collection3d(Poly3DCollection(corners, clip_on=False, **style))
     else:
-        ax.add_collection(PolyCollection(polygons, **style))
-
-
-def _set_extent(ax: Any, points: NDArray[np.float64], *, zoom: float) -> None:
-    """Set limits that contain points (n, N, D), equal scales, and no visible axes."""
-    low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
-    ax.set_xlim(low[0], high[0])
-    ax.set_ylim(low[1], high[1])
+        ax.add_collection(PolyCollection(corners, **style))
+    low, high = (end(np.stack([points, *deformed]), axis=(0, 1)) for end in (np.min, np.max))
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     if len(low) == 3:
         ax.set_zlim(low[2], high[2])
-        ax.set_box_aspect(high - low, zoom=zoom)
+        ax.set_box_aspect(high - low)
         ax.view_init(elev=18, azim=-60)
     else:
         ax.set_aspect("equal")
     ax.set_axis_off()
+    return scale
 
 
 def plot_errors(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "Figure":
     """Return a figure of errors against displacement, and of their cumulative distribution.
 
-    Loads without a finite error are left out and counted in the title.
-
-    Args:
-        relative: Relative L2 errors, (B,) [-].
-        size: Largest true displacement of each load over L, (B,) [-].
-        marked: Indices of loads to annotate.
+    They are the relative L2 errors (B,) of loads and their largest displacements over L, (B,).
+    `marked` loads are annotated; those without a finite error are left out, counted in the title.
     """
     from matplotlib.figure import Figure
 
@@ -116,8 +100,3 @@ def plot_errors(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "
     title = f"{len(error)} validation loads"
     figure.suptitle(title + (f", {missing} without a finite error" if missing else ""), fontsize=11)
     return figure
-
-
-def error_colours(error: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return RGB colours (N, 3) of distances (N,) on the colour scale of `plot_deformed`."""
-    return (error_scale(error).to_rgba(error)[:, :3] * 255).round().astype(np.uint8)

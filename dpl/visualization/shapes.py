@@ -22,6 +22,7 @@ SMALLEST_ERROR = 1e-12  # smallest upper end of a colour scale
 ELEVATION, AZIMUTH = np.deg2rad((18.0, -60.0))  # of the view
 PANEL = 3.2  # longer side of a panel [inch]
 GAP, LINE, BAR = 0.08, 0.17, 0.12  # between panels, of a line of text, of a colour bar [inch]
+MARGIN, BELOW = 0.05, 0.75  # beside and below all panels [inch]
 LABEL = "nodal error / L [-]"
 OUTSIDE = 0.5  # part of the size of a body that predictions extend a panel by at most
 REFERENCE = "finite elements"
@@ -33,29 +34,27 @@ def plot_deformed(
     predictions: Sequence[tuple[str, Tensor]],
     *,
     names: Sequence[str] = (),
-    upright: bool = False,
     max_polygons: int | None = None,
 ) -> "Figure":
     """Return a figure of the reference shapes and of predicted shapes beside them.
 
-    Columns are loads. The first row shows the reference in grey with the outline of the undeformed
-    body. Each other row shows a prediction, coloured by the nodal error with a scale of its own,
-    and the outline of the reference in black. A scale is logarithmic if errors span decades. A
-    prediction that is not finite is left out of its panel.
+    Rows are loads; the figure fits TensorBoard's narrow cards. The first column shows the reference
+    in grey with the outline of the undeformed body. Each other column shows a prediction, coloured
+    by the nodal error with a scale of its own, and the outline of the reference in black. A scale
+    is logarithmic if errors span decades. A prediction that is not finite is left out of its panel.
 
     Args:
         problem: The body.
         truth: Displacements over L, (B, N, D) [-].
         predictions: Pairs of a name and displacements over L, (B, N, D) [-].
         names: Titles of the loads.
-        upright: Put loads in rows and predictions in columns, for TensorBoard's narrow cards.
         max_polygons: Largest number of polygons per body, see `coarse`; None: all.
     """
     body = _Outlined(problem, max_polygons)
     true, *fields = (u.detach().cpu().numpy() for u in (truth, *(u for _, u in predictions)))
     extents = _extents(body.points, true, fields)
     lines = max((name.count("\n") + 1 for name in names), default=0)
-    figure, axes, bars = _grid(len(predictions) + 1, extents, lines, upright=upright)
+    figure, axes, bars = _grid(len(predictions) + 1, extents, lines)
     for load, (ax, u) in enumerate(zip(axes[0], true, strict=True)):
         body.draw_lines(ax, body.points, "0.6", zorder=0)
         body.draw(ax, body.points + u, body.shades(body.points + u), "0.2")
@@ -66,12 +65,14 @@ def plot_deformed(
         scale = error_scale(error)
         for ax, u, exact, value in zip(row, field, true, error, strict=True):
             if np.isfinite(u).all():
-                body.draw(ax, body.points + u, scale.to_rgba(body.at_polygons(value)), "0.75")
+                means = value[body.polygons].mean(axis=1)
+                body.draw(ax, body.points + u, scale.to_rgba(means), "0.75")
             body.draw_lines(ax, body.points + exact, "black", zorder=2)
-        _add_colour_bar(bar, scale, upright=upright)
-    names_at = axes[:, -1] if upright else axes[:, 0]
-    for ax, name in zip(names_at, [REFERENCE, *(name for name, _ in predictions)], strict=True):
-        (ax.set_xlabel if upright else ax.set_ylabel)(name or "prediction", labelpad=2)
+        figure.colorbar(scale, cax=bar, orientation="horizontal").set_label(LABEL, fontsize=8)
+        bar.tick_params(labelsize=7)
+        bar.minorticks_off()
+    for ax, name in zip(axes[:, -1], [REFERENCE, *(name for name, _ in predictions)], strict=True):
+        ax.set_xlabel(name or "prediction", labelpad=2)
     for row in axes:
         for ax, (low, high) in zip(row, extents, strict=True):
             ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xticks=[], yticks=[])
@@ -81,31 +82,20 @@ def plot_deformed(
 
 
 class _Outlined:
-    """Polygons and feature edges of the surface of a body.
-
-    Attributes:
-        points: Nodes, (N, D).
-        polygons: Of the surface, (P, corners).
-        edges: Feature edges, (K, 2).
-        sides: Feature edges once for each of their polygons, (S, 2).
-        owners: These polygons, (S, corners).
-    """
+    """Polygons and feature edges of the surface of a body."""
 
     def __init__(self, problem: Problem, max_polygons: int | None) -> None:
         self.points = problem.points.cpu().numpy()
-        self.polygons = every = surface(problem.mesh)
+        self.polygons = every = surface(problem.mesh)  # (P, corners)
         edges, features = facet_edges(self.points, every)
-        self.edges = edges[features]
+        self.edges = edges[features]  # (K, 2)
         sides = np.stack([every, np.roll(every, -1, axis=1)], axis=-1)  # (P, corners, 2)
         key = np.sort(sides, axis=2) @ [len(self.points), 1]
         owner, side = np.isin(key, np.sort(self.edges, axis=1) @ [len(self.points), 1]).nonzero()
+        # feature edges once for each of their polygons, (S, 2), and these polygons, (S, corners)
         self.sides, self.owners = sides[owner, side], every[owner]
         if max_polygons:
             self.polygons = coarse(self.points, every, max_polygons)
-
-    def at_polygons(self, values: Array) -> Array:
-        """Return the means, (P,), of values at the nodes, (N,)."""
-        return values[self.polygons].mean(axis=1)
 
     def shades(self, points: Array) -> Array:
         """Return greys, (P, 3), of the polygons under a light from the upper left; 2D: one grey."""
@@ -187,9 +177,9 @@ def _extents(points: Array, true: Array, fields: Sequence[Array]) -> list[tuple[
 
 
 def _grid(
-    rows: int, extents: Sequence[tuple[Array, Array]], titles: int, *, upright: bool
+    columns: int, extents: Sequence[tuple[Array, Array]], titles: int
 ) -> tuple["Figure", Any, Any]:
-    """Return a figure, its axes (1 + predictions, loads), and axes of the colour bars.
+    """Return a figure, its axes (columns, loads), and axes of colour bars of all columns but one.
 
     The panels have the shape of the body. There are `titles` lines above a load.
     """
@@ -197,12 +187,8 @@ def _grid(
 
     low, high = extents[0]
     width, height = (high - low) * min(PANEL / (high - low))
-    top, loads = 0.08 + LINE * titles, len(extents)
-    left, below, right = (0.05, 0.75, 0.05) if upright else (0.25, 0.05, 0.85)
-    columns, lines = (rows, loads) if upright else (loads, rows)
-    step = height + (top if upright else 0.0) + GAP
-    tall = below + lines * step + (0 if upright else top)
-    size = left + columns * (width + GAP) + right, tall
+    step, loads = height + 0.08 + LINE * titles + GAP, len(extents)
+    size = 2 * MARGIN + columns * (width + GAP), BELOW + loads * step
     figure = Figure(figsize=size, dpi=DPI)
     figure.set_layout_engine("none")  # panels are placed here, whatever the style says
 
@@ -210,24 +196,9 @@ def _grid(
         room = x / size[0], y / size[1], w / size[0], h / size[1]
         return figure.add_axes(room, label=label)
 
-    def place(row: int, load: int) -> tuple[float, float]:
-        column, line = (row, load) if upright else (load, row)
-        return left + column * (width + GAP), below + (lines - 1 - line) * step
-
-    axes = [[add(*place(row, load), width, height) for load in range(loads)] for row in range(rows)]
-    bars = []
-    for row in range(1, rows):
-        x, y = place(row, loads - 1)
-        if upright:
-            room = x + 0.08 * width, y - 0.33, 0.84 * width, BAR
-        else:
-            room = x + width + GAP, y + 0.04 * height, BAR, 0.92 * height
-        bars.append(add(*room, label="<colorbar>"))
+    left = [MARGIN + column * (width + GAP) for column in range(columns)]
+    heights = [BELOW + (loads - 1 - load) * step for load in range(loads)]
+    axes = [[add(x, y, width, height) for y in heights] for x in left]
+    place = BELOW - 0.33, 0.84 * width, BAR
+    bars = [add(x + 0.08 * width, *place, label="<colorbar>") for x in left[1:]]
     return figure, np.array(axes), bars
-
-
-def _add_colour_bar(bar: Any, scale: "ScalarMappable", *, upright: bool) -> None:
-    side = "horizontal" if upright else "vertical"
-    bar.figure.colorbar(scale, cax=bar, orientation=side).set_label(LABEL, fontsize=8)
-    bar.tick_params(labelsize=7)
-    bar.minorticks_off()

@@ -8,20 +8,15 @@ import pytest
 
 from benchmarks import error_estimates
 from benchmarks.error_estimates import Estimate, measured, summarised
-from dpl import Sample
+from benchmarks.samples import first
 from dpl.fem import solve
 from dpl.inference import Simulator
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
 
 
-@pytest.fixture(scope="module")
-def samples(scene):
-    load = scene.loads.sample((0, 9), range(4))
-    return Sample(load.force, solve(scene.solver, load).displacement, load.young)
-
-
-def test_errors_are_those_of_the_answers(scene, samples):
+def test_errors_are_those_of_the_answers(scene, batch):
+    samples = first(batch, 4)
     surrogate = Surrogate(FCNN(scene, width=4), MSE(), scene)
     surrogate.predict = lambda load: 0.99 * solve(scene.solver, load).displacement
     found = list(measured(Simulator(surrogate), samples, {}))
@@ -34,7 +29,7 @@ def test_errors_are_those_of_the_answers(scene, samples):
 
 
 def test_softened_bodies_are_stable_and_nearer_to_buckling_than_others():
-    scene = error_estimates.beam()
+    scene = error_estimates.BODIES["beam"]()
     found = error_estimates.softened(scene, 2)
     assert list(found) == ["compressed", "twisted", "pinched"]
     assert all(len(some.force) for some in found.values())

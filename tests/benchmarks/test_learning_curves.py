@@ -28,14 +28,6 @@ def test_a_resumed_run_has_one_curve(tmp_path):
     assert [point.epoch for point in learning_curves.curve(run)] == [1, 2, 3]
 
 
-def test_csv_logs_are_read(tmp_path):
-    path = tmp_path / "fcnn" / "csv" / "metrics.csv"
-    path.parent.mkdir(parents=True)
-    path.write_text(f"epoch,loss/train,{ERROR}\n0,1.0,\n0,,0.5\n5,,0.25\n")
-    expected = [Validation("fcnn", 1, 0.5), Validation("fcnn", 6, 0.25)]
-    assert learning_curves.curve(path.parents[1]) == expected
-
-
 def test_a_run_with_fewer_than_two_validations_has_no_curve(tmp_path):
     write_events(tmp_path / "once", {0: 0.5})
     (tmp_path / "unrolled").mkdir()

@@ -7,9 +7,8 @@ import pytest
 import skfem
 
 from benchmarks.verification.artery import ARTERIES, exact_radius, radius
-from benchmarks.verification.cardiac import ENDO, EPI, TIP, apex_of, beam_tip, inflated
+from benchmarks.verification.cardiac import ENDO, EPI, TIP, apex_of, beam_tip, contracted, inflated
 from benchmarks.verification.composites import RATIOS, REMOTE, ball_strain, bent, eshelby
-from benchmarks.verification.contraction import contracted
 from benchmarks.verification.ventricle import (
     BASE,
     LONG,

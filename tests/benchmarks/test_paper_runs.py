@@ -13,7 +13,7 @@ import yaml
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from benchmarks import loss_table, paper
+from benchmarks import paper, results
 from benchmarks.paper import Run, State
 from benchmarks.results import EXPERIMENTS
 from dpl.commands import dry_run
@@ -123,19 +123,13 @@ def test_the_shipped_plan_has_all_experiments_losses_and_three_seeds():
 # ------------------------------------------------------------------ states
 
 
-@pytest.fixture
-def run():
-    return Run("one", "beam_svk/fcnn", ("model=fcnn",))
-
-
-def begin(folder, target="dpl.models.FCNN", **files):
+def begin(folder, target="dpl.models.FCNN"):
     (folder / "checkpoints").mkdir(parents=True)
     (folder / "config.yaml").write_text(f"model:\n  _target_: {target}\n")
-    for name in files.values():
-        (folder / name).write_text("[]")
 
 
-def test_states_follow_from_the_folder_of_a_run(run, tmp_path):
+def test_states_follow_from_the_folder_of_a_run(tmp_path):
+    run = Run("one", "beam_svk/fcnn", ("model=fcnn",))
     folder = tmp_path / run.path
     paper.keep_options(run, tmp_path)
     assert paper.state(run, tmp_path) == State.MISSING
@@ -149,7 +143,8 @@ def test_states_follow_from_the_folder_of_a_run(run, tmp_path):
     assert paper.state(other, tmp_path) == State.OTHER_OPTIONS
 
 
-def test_trainings_are_resumed_and_fitted_models_are_evaluated(run, tmp_path):
+def test_trainings_are_resumed_and_fitted_models_are_evaluated(tmp_path):
+    run = Run("one", "beam_svk/fcnn", ("model=fcnn",))
     folder = tmp_path / run.path
     script, arguments = paper.arguments(run, tmp_path, State.MISSING)
     assert (script, arguments) == ("train", ["model=fcnn", f"run={folder}", "ckpt_path=last"])
@@ -218,7 +213,7 @@ def test_losses_are_medians_over_seeds():
         for loss, factor in (("mse", 1.0), ("energy_norm", 10.0))
         for seed in range(3)
     }
-    rows = loss_table.summaries({**runs, "mine": [5.0] * 8})
+    rows = results.loss_rows({**runs, "mine": [5.0] * 8})
     assert [(row.runs, row.seeds, row.e_mean) for row in rows] == [
         ("linear-mse", 3, 2.0),
         ("linear-energy_norm", 3, 20.0),
@@ -233,7 +228,7 @@ def test_numbers_of_a_run_are_those_of_its_evaluation(tmp_path):
         {"solver": "paper's hybrid to 1e-6", "errors": {}, "iterations": 5.5},
     ]
     (tmp_path / "evaluation.json").write_text(json.dumps(rows))
-    found = loss_table.numbers(tmp_path)
+    found = results.loss_numbers(tmp_path)
     assert found[:4] == [1.0, 2.0, 3.0, 4.0]
     assert found[4] != found[4], "unknown"
     assert found[6] == 5.5

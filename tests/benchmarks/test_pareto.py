@@ -3,33 +3,22 @@
 import pytest
 
 from benchmarks import pareto
-from dpl import Sample
+from benchmarks.samples import first
 from dpl.fem import solve
 from dpl.inference import Direct, Hybrid
 
 
 @pytest.fixture(scope="module")
-def batch(scene):
-    """Six loads with reference solutions."""
-    load = scene.loads.sample((0, 9), range(6))
-    return Sample(load.force, solve(scene.solver, load).displacement, load.young)
-
-
-@pytest.fixture(scope="module")
-def solvers(scene):
-    """A network with an error of 1e-3, alone and corrected, and Newton."""
+def rows(scene, batch):
+    """Rows of a network with an error of 1e-3, alone and corrected, and of Newton."""
     near = lambda load: 1.001 * solve(scene.solver, load).displacement  # noqa: E731
-    return {
+    solvers = {
         "linear": scene.linear,
         "Newton to 1e-08": scene.solver,
         "near": Direct(near, scene.problem),
         "near, hybrid": Hybrid(near, scene.corrector),
     }
-
-
-@pytest.fixture(scope="module")
-def rows(solvers, batch):
-    return pareto.points(solvers, batch)
+    return pareto.points(solvers, first(batch, 6))
 
 
 def test_errors_are_those_of_the_iterates(rows):

@@ -13,18 +13,13 @@ from benchmarks.stress.case import classify
 ROUNDED = ("T1", "T3", "T4", "T8", "T10")  # their references are rounded: the last digit is right
 
 
-def name_of(case: Case) -> str:
-    return f"{case.name}, {case.description}"
-
-
 def marked(case: Case):
     is_long = case.name == "sweep" or (case.name == "T2" and "q = 1000 Pa" not in case.description)
-    return pytest.param(case, marks=[pytest.mark.slow] if is_long else [])
+    name, marks = f"{case.name}, {case.description}", [pytest.mark.slow] if is_long else []
+    return pytest.param(case, marks=marks, id=name)
 
 
-@pytest.mark.parametrize(
-    "case", [*map(marked, select_cases())], ids=[*map(name_of, select_cases())]
-)
+@pytest.mark.parametrize("case", map(marked, select_cases()))
 def test_case_has_the_expected_outcome(case, in_process):
     """The sandbox of the files is tested in tests/fem/test_mesh_sandbox.py."""
     line, outcome = run_case(case)
@@ -80,9 +75,9 @@ def table(path):
 def test_only_what_is_silently_wrong_ends_the_command_with_1(
     script, tmp_path, monkeypatch, outcome, status
 ):
-    first = Case("T0", "a case", "nothing", lambda auditor: outcome)
-    second = Case("T0", "the next one", "nothing", lambda auditor: classify("well"))
-    monkeypatch.setattr(stress, "select_cases", lambda wanted: [first, second])
+    runs = (lambda auditor: outcome), (lambda auditor: classify("well"))
+    found = [Case("T0", "a case", "nothing", run) for run in runs]
+    monkeypatch.setattr(stress, "select_cases", lambda wanted: found)
     ended = script("stress", cwd=tmp_path)
     assert ended.status == status
     rows = table(tmp_path / "runs/stress/cases.csv")

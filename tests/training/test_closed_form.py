@@ -27,8 +27,7 @@ def small(monkeypatch):
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-@pytest.mark.parametrize("grows", [False, True])
+@pytest.mark.parametrize(("grows", "workers"), [(False, 0), (True, 1)])
 def test_loads_solved_from_predictions_are_those_solved_from_rest(
     scene, tmp_path, monkeypatch, capsys, grows, workers
 ):

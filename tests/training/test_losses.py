@@ -12,7 +12,6 @@ from omegaconf import OmegaConf
 
 import dpl.fem as fem
 from dpl import Sample
-from dpl.fem.postprocess import RestStiffness
 from dpl.models import FCNN
 from dpl.training import (
     MSE,
@@ -68,19 +67,14 @@ def inverted(scene, few):
 def evaluations(monkeypatch):
     """Counts the evaluations of forces, by tensors and by compiled loops, and of energies."""
     counts = []
-
-    def count(name):
+    for name in ("internal_force", "evaluate", "energy"):
         original = getattr(fem.Problem, name)
 
-        def counted(problem, displacement):
-            counts.append(len(displacement))
-            return original(problem, displacement)
+        def counted(problem, u, original=original):
+            counts.append(len(u))
+            return original(problem, u)
 
         monkeypatch.setattr(fem.Problem, name, counted)
-
-    count("internal_force")
-    count("evaluate")
-    count("energy")
     return counts
 
 
@@ -142,9 +136,9 @@ def test_the_negative_gradient_of_a_loss_is_finite_and_a_descent_direction(
     "loss",
     [
         *(RMSELoss(relative=0.8), LrPlus(), PotentialEnergyLoss()),
-        *(EnergyNormLoss(), EnergyNormLoss(relative=False)),
+        EnergyNormLoss(),
     ],
-    ids=["rmse", "lr_plus", "energy", "energy norm", "energy norm of the batch"],
+    ids=["rmse", "lr_plus", "energy", "energy norm"],
 )
 def test_the_gradient_of_a_loss_equals_finite_differences(loss, few, physics, near):
     for expected, found in slopes_along(loss, near, few, physics):
@@ -171,7 +165,7 @@ def test_the_loss_of_a_batch_is_the_mean_over_samples_except_for_residual_weight
         PotentialEnergyLoss(floor=0.0),
     )
     rmse = RMSELoss(), RMSELoss(relative=0.8, floor=0.0)
-    for loss in (MSE(), LrPlus(), LrStar(per_sample=True), *relative, *rmse):
+    for loss in (MSE(), LrPlus(), *relative, *rmse):
         parts = [loss(near[k : k + 1], one, physics) for k, one in enumerate(singles(few))]
         whole = loss(near, few, physics)
         assert float(whole) == pytest.approx(float(torch.stack(parts).mean()), rel=1e-12)
@@ -217,7 +211,7 @@ def test_the_gradient_of_rmse_loss_does_not_vanish_with_the_error(few, physics, 
 
 @pytest.mark.parametrize(
     ("loss", "evaluated"),
-    [(MSE(), []), (LrStar(), [4]), (LrStar(per_sample=True), [4]), (LrPlus(), [4, 4, 4])],
+    [(MSE(), []), (LrStar(), [4]), (LrPlus(), [4, 4, 4])],
 )
 def test_a_loss_evaluates_finite_elements_no_more_than_its_gradient_needs(
     loss, evaluated, few, physics, near, evaluations
@@ -244,7 +238,6 @@ def test_residual_losses_are_the_formulas_of_their_terms(scene, few, physics, ne
     plain = gradient(MSE(), near, few, physics)
     formulas = [
         (LrStar(), error.mean() * norms.mean(), norms.mean() * plain),
-        (LrStar(per_sample=True), (error * norms).mean(), norms[:, None, None] * plain),
         *((LrPlus(weight=w), error.mean() + w * norms.mean(), None) for w in (0.0, 1.0, 2.5)),
     ]
     for loss, expected, slope in formulas:
@@ -289,7 +282,6 @@ def test_an_inverted_sample_has_the_largest_residual_and_no_gradient(few, physic
         (lambda: EnergyNormLoss(floor=-0.1), "floor"),
         (lambda: PotentialEnergyLoss(floor=float("nan")), "floor"),
         (lambda: LrPlus(weight=-1.0), "weight"),
-        (lambda: LrPlus(warmup_epochs=-1), "warmup_epochs"),
         (lambda: BlendedLoss(MSE(), MSE(), epochs=0), "epochs"),
         (lambda: BlendedLoss(MSE(), MSE(), epochs=1, start=-1), "start"),
     ],
@@ -311,9 +303,6 @@ def test_energy_norm_loss_is_the_squared_energy_norm_of_the_error(scene, few, ph
     error, size = work(near - few.displacement), work(few.displacement)
     expected = float((error / size).mean())
     assert float(EnergyNormLoss(floor=0.0)(near, few, physics)) == pytest.approx(expected, rel=1e-9)
-    expected = float(error.mean() / size.mean())
-    found = float(EnergyNormLoss(relative=False)(near, few, physics))
-    assert found == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("kind", [EnergyNormLoss, PotentialEnergyLoss])
@@ -371,18 +360,6 @@ def test_potential_energy_loss_is_relative_to_the_work_of_the_linear_solution(
     assert found == pytest.approx(float((total / work).mean()), rel=1e-9)
 
 
-def test_light_and_heavy_loads_have_equal_weight(scene, few, physics):
-    """For small loads the loss is -1 plus the squared relative energy norm of the error."""
-    energy, stiffness = PotentialEnergyLoss(floor=0.0), EnergyNormLoss(floor=0.0)
-    for amplitude in (1e-3, 1e-5):
-        force = amplitude * few.force
-        linear = torch.stack([scene.linear.solve(one) for one in force])
-        light = Sample(force, linear, few.young)
-        for u in (linear, 0.9 * linear, 0.5 * linear):
-            expected = -1 + float(stiffness(u, light, physics))
-            assert float(energy(u, light, physics)) == pytest.approx(expected, abs=1e-3)
-
-
 def test_losses_are_finite_for_zero_loads(few, physics, near):
     still = Sample(0 * few.force, 0 * few.displacement, few.young)
     for loss in (PotentialEnergyLoss(), EnergyNormLoss(), MSE(relative=True), LrPlus(), LrStar()):
@@ -403,23 +380,6 @@ def test_an_inverted_sample_has_the_linear_strain_energy(scene, few, physics, in
     slope = gradient(PotentialEnergyLoss(floor=0.0), inverted, few, physics)
     expected = torch.where(problem.free, image, 0.0) / work[:, None, None] / len(work)
     assert torch.allclose(slope, expected, rtol=1e-9, atol=1e-12 * float(expected.abs().max()))
-
-
-def test_descent_from_inverted_samples_reaches_states_without_inversion(
-    scene, unanswered, physics, inverted
-):
-    u, problem, loss = inverted.clone().requires_grad_(), scene.problem, PotentialEnergyLoss()
-    assert loss(u, unanswered, physics) > 0
-    assert float(loss.terms["inverted"]) == 1
-    optimizer = torch.optim.Adam([u], lr=0.02)
-    for _ in range(200):
-        optimizer.zero_grad()
-        loss(u, unanswered, physics).backward()
-        optimizer.step()
-    u = u.detach()
-    assert (problem.volume_ratio(u) > 0).all()
-    loss(u, unanswered, physics)
-    assert float(loss.terms["inverted"]) == 0
 
 
 def test_potential_energy_loss_has_no_minimum_with_inverted_elements(few, make_scene):
@@ -450,33 +410,6 @@ def test_springs_are_part_of_the_energy(few):
     off = exact + torch.where(problem.free, 1e-3, 0.0)
     slopes = [gradient(PotentialEnergyLoss(), u, few, physics).norm() for u in (exact, off)]
     assert slopes[0] < 1e-6 * slopes[1]
-    for expected, found in slopes_along(PotentialEnergyLoss(), off, few, physics):
-        assert found == pytest.approx(expected, rel=1e-5)
-
-
-def test_minimising_the_energy_reaches_the_solutions_of_newton(scene, few, unanswered, physics):
-    """In coordinates y with K(0) = L L^T and u = L^-T y, in which K(0) is the identity."""
-    loss, free = PotentialEnergyLoss(floor=0.0), scene.problem.free
-    root = torch.linalg.cholesky(torch.from_numpy(RestStiffness(scene.problem)._matrix.toarray()))
-    size = RestStiffness(scene.problem).linear_strain_energy(few.force).sqrt()[:, None]
-    y = torch.zeros(len(few.force), len(root), dtype=torch.float64, requires_grad=True)
-
-    def displacement():
-        moved = torch.linalg.solve_triangular(root.mT, (size * y).mT, upper=True).mT
-        return torch.zeros_like(few.force).masked_scatter(free.expand_as(few.force), moved)
-
-    options = {"max_iter": 200, "history_size": 50, "tolerance_change": 1e-14}
-    search = torch.optim.LBFGS([y], line_search_fn="strong_wolfe", **options)
-
-    def energy():
-        search.zero_grad()
-        value = loss(displacement(), unanswered, physics)
-        value.backward()
-        return value
-
-    search.step(energy)
-    error = (displacement() - few.displacement).flatten(1).norm(dim=1)
-    assert (error < 1e-5 * few.displacement.flatten(1).norm(dim=1)).all()
 
 
 # ------------------------------------------------------------------ from one loss to another
@@ -499,7 +432,7 @@ def test_a_blended_loss_is_the_weighted_sum_of_its_parts(few, physics, near):
 def test_both_parts_of_a_blended_loss_follow_the_epochs_and_none_is_evaluated_for_nothing(
     few, physics, near, evaluations
 ):
-    loss = BlendedLoss(MSE(), LrPlus(weight=2.0, warmup_epochs=4), epochs=2)
+    loss = BlendedLoss(MSE(), BlendedLoss(MSE(), LrPlus(weight=2.0), epochs=4), epochs=2)
     assert loss.second.weight == 0.0
     loss(near, few, physics)
     assert evaluations == []
@@ -508,10 +441,11 @@ def test_both_parts_of_a_blended_loss_follow_the_epochs_and_none_is_evaluated_fo
     for epoch in (1, 3, 4, 5):
         loss.on_train_epoch_start(SimpleNamespace(current_epoch=epoch), None)
         seen.append(loss.second.weight)
-    assert seen == [0.5, 1.5, 2.0, 2.0]
+    assert seen == [0.25, 0.75, 1.0, 1.0]
     loss(near, few, physics)
     assert evaluations == [4]
-    assert set(loss.terms) == {"weight", "second", "second/error", "second/residual"}
+    parts = {"weight", "second", "second/error", "second/residual"}
+    assert set(loss.terms) == {"weight", "second", *(f"second/{part}" for part in parts)}
     assert MSE().skipped_work() == [
         "no finite-element evaluation in training: the loss has no residual term"
     ]

@@ -4,8 +4,6 @@ import io
 
 import pytest
 import torch
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 from torch import nn
 
 from dpl.training import Muon, warmup_cosine
@@ -92,17 +90,6 @@ def test_matrices_are_made_orthogonal_in_their_own_precision(shape):
     assert rest.norm() < 1e-4 * answer.norm()
 
 
-def test_steps_of_matrices_have_the_size_of_adams_steps():
-    """The root mean square is 0.2 times the learning rate (Liu et al. 2025)."""
-    for size in (1e-4, 1e4):
-        torch.manual_seed(0)
-        matrix = nn.Parameter(torch.zeros(32, 64))
-        optimizer = Muon([matrix], lr=1e-2)
-        matrix.grad = size * torch.randn(32, 64)
-        optimizer.step()
-        assert 0.15 < float(matrix.detach().square().mean().sqrt()) / 1e-2 < 0.25
-
-
 @pytest.mark.parametrize("shape", [(4, 3), (4,)], ids=["matrices", "vectors"])
 def test_parameters_of_one_kind_move_decay_and_need_a_gradient(shape):
     moving, still, fixed = (nn.Parameter(torch.ones(shape)) for _ in range(3))
@@ -135,13 +122,6 @@ def test_a_closure_is_evaluated_once_with_gradients_and_its_loss_returned():
     assert optimizer.step() is None
 
 
-def rates(optimizer):
-    return [group["lr"] for group in optimizer.param_groups]
-
-
-# ------------------------------------------------------------------ states
-
-
 def saved(value):
     file = io.BytesIO()
     torch.save(value, file)
@@ -158,7 +138,7 @@ def test_a_saved_state_continues_bit_for_bit():
     optimizer, scheduler = fresh(straight)
     seen = []
     for k in range(8):
-        seen += rates(optimizer)
+        seen.append(optimizer.param_groups[0]["lr"])
         if k == 4:
             parts = (straight, optimizer, scheduler)
             states = saved([part.state_dict() for part in parts])
@@ -171,13 +151,10 @@ def test_a_saved_state_continues_bit_for_bit():
     for k in range(4, 8):
         step(resumed, parts[1], k=k, scheduler=parts[2])
     assert same(straight, resumed)
-    assert rates(optimizer) == rates(parts[1])
+    assert optimizer.param_groups[0]["lr"] == parts[1].param_groups[0]["lr"]
     assert seen[0] < seen[1] > seen[7] > 0, "the schedule reaches both parts"
     assert loss_of(straight) < loss_of(network())
     assert not any(map(torch.equal, straight.parameters(), network().parameters()))
-
-
-# ------------------------------------------------------------------ options
 
 
 @pytest.mark.parametrize(
@@ -186,9 +163,6 @@ def test_a_saved_state_continues_bit_for_bit():
         ({"params": []}, "empty"),
         ({"momentum": 1.0}, "momentum = 1.0"),
         ({"momentum": -0.1}, "momentum = -0.1"),
-        ({"lr": -1.0}, "(?i)learning rate.*-1"),
-        ({"weight_decay": -1.0}, "(?i)weight.decay.*-1"),
-        ({"betas": (1.5, 0.9)}, "(?i)beta.*1.5"),
         ({"betas": (0.9, -0.5)}, "(?i)beta.*-0.5"),
     ],
 )
@@ -196,12 +170,3 @@ def test_invalid_options_raise_an_error_with_their_name(options, reported):
     """Vectors alone suffice; commands validate an optimiser in this way."""
     with pytest.raises(ValueError, match=reported):
         Muon(**{"params": [nn.Parameter(torch.zeros(1))], **options})
-
-
-def test_the_file_in_conf_makes_it(request):
-    node = OmegaConf.load(request.config.rootpath / "conf" / "optimizer" / "muon.yaml")
-    optimizer = instantiate(node, _convert_="all")(network().parameters())
-    assert isinstance(optimizer, Muon)
-    (group,) = optimizer.param_groups
-    assert (group["lr"], group["momentum"]) == (node.lr, node.momentum)
-    assert list(group["betas"]) == list(node.betas)

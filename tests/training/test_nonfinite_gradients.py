@@ -102,7 +102,7 @@ def test_a_median_error_above_one_prints_a_warning(tmp_path, capsys, error, said
 
 
 def test_a_learning_rate_far_too_high_ends_with_one_line(script, tiny_training, tmp_path):
-    wild = ["optimizer.lr=1e6", "trainer.max_epochs=30", "run=runs/wild"]
+    wild = ["optimizer.lr=1e6", "logger=none", "trainer.max_epochs=30", "run=runs/wild"]
     ended = script("train", *tiny_training, *wild, cwd=tmp_path)
     assert ended.status == 2
     last = ended.err.strip().splitlines()[-1]
@@ -113,7 +113,7 @@ def test_a_learning_rate_far_too_high_ends_with_one_line(script, tiny_training, 
 
 def test_a_training_with_nonfinite_predictions_fails(script, tiny_training, tmp_path):
     """The run is shorter than `patience`, and every validation gives NaN."""
-    wild = ["optimizer.lr=1e6", "trainer.max_epochs=3", "run=wild"]
+    wild = ["optimizer.lr=1e6", "logger=none", "trainer.max_epochs=3", "run=wild"]
     ended = script("train", *tiny_training, *wild, cwd=tmp_path)
     assert ended.status == 2
     last = ended.err.strip().splitlines()[-1]

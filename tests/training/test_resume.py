@@ -5,7 +5,6 @@ on another file system.
 """
 
 import contextlib
-import ctypes
 import hashlib
 import io
 import os
@@ -13,7 +12,6 @@ import resource
 import runpy
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import traceback
@@ -106,17 +104,6 @@ def limiting(name, most):
     checkpointing.write = full
 
 
-def mounting(folder):
-    """Mount a folder read-only for this process, since root can write to any folder."""
-    user, group = os.getuid(), os.getgid()
-    assert ctypes.CDLL(None).unshare(0x10020000) == 0  # CLONE_NEWUSER and CLONE_NEWNS
-    Path("/proc/self/setgroups").write_text("deny")
-    for name, number in (("uid_map", user), ("gid_map", group)):
-        Path("/proc/self", name).write_text(f"0 {number} 1")
-    for options in (["--bind", folder], ["-o", "remount,bind,ro"]):
-        subprocess.run(["mount", *options, folder], check=True)
-
-
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
     """A folder with a user's network, and later a data set."""
@@ -145,7 +132,7 @@ def overrides(tiny_training, home):
         kept = [o for o in tiny_training if "model." not in o]
         quiet = "callbacks.progress_bar._target_=lightning.pytorch.callbacks.TQDMProgressBar"
         sizes = [f"data.folder={home}/data", f"trainer.max_epochs={EPOCHS}", "data.workers=0"]
-        return [*kept, *networks[net], *sizes, f"run={name}", quiet]
+        return [*kept, *networks[net], *sizes, f"run={name}", quiet, "logger=none"]
 
     return overrides
 
@@ -250,19 +237,6 @@ def test_a_full_disk_ends_training_with_one_line_and_intact_files(forked, home, 
     assert read(home / run / "checkpoints/best.safetensors")["epoch"] <= 2
     left = {path.name for path in (home / run / "checkpoints").iterdir()}
     assert left == {"best.safetensors", "last.ckpt"}
-
-
-@pytest.mark.skipif(os.system("unshare -rm true 2>/dev/null") != 0, reason="needs unshare")
-@pytest.mark.parametrize("below", [pytest.param(".", marks=pytest.mark.slow), "checkpoints"])
-def test_a_read_only_folder_ends_training_with_one_line(forked, home, below):
-    run = home / f"read-only-{below}"
-    (run / below).mkdir(parents=True)
-    status, err = forked(partial(mounting, str(run / below)), run.name)
-    assert status == 2, err[-2000:]
-    line = err.strip().splitlines()[-1]
-    assert line.startswith("error: "), line
-    assert "ead-only" in line or "no permission to write" in line, line
-    assert "Traceback" not in err
 
 
 @pytest.mark.parametrize("net", ["noisy", pytest.param("fcnn", marks=pytest.mark.slow)])

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from dpl.fem import NeoHookeanLn, Plane, Problem, box, rectangle, surface
 from dpl.fem.postprocess import coarse, triangles
-from dpl.visualization import draw_body, error_colours, plot_deformed, plot_errors
-from dpl.visualization.shapes import project
+from dpl.visualization import draw_body, plot_deformed, plot_errors
+from dpl.visualization.shapes import error_scale, project
 
 
 def panels(figure):
@@ -24,9 +24,9 @@ def faces(ax):
     return np.asarray(shape.get_facecolor())[areas]
 
 
-@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
-def test_a_figure_has_rows_of_reference_and_predictions_and_one_column_per_load(make_scene, cell):
-    plane = {"mesh": rectangle([8.0, 2.0], [5, 3], cell)} if cell in ("quad", "triangle") else {}
+@pytest.mark.parametrize("cell", ["tetra", "quad"])
+def test_a_figure_has_columns_of_reference_and_predictions_and_one_row_per_load(make_scene, cell):
+    plane = {"mesh": rectangle([8.0, 2.0], [5, 3], cell)} if cell == "quad" else {}
     scene = make_scene(**(plane or {"cell": cell}), n_modes=2)
     truth = 0.01 * torch.randn(2, *scene.problem.shape, dtype=torch.float64)
     shown = [("network", truth * 0.9), ("linear", truth * 1.1), ("exact", truth)]
@@ -35,24 +35,22 @@ def test_a_figure_has_rows_of_reference_and_predictions_and_one_column_per_load(
     axes = panels(figure)
     assert len(axes) == 8
     assert [ax.get_title(loc="left") for ax in axes[:3]] == ["first", "second", ""]
-    assert [ax.get_ylabel() for ax in axes[::2]] == ["finite elements", *(n for n, _ in shown)]
-    assert [bar.get_ylabel() for bar in figure.axes[8:]] == 3 * ["nodal error / L [-]"]
+    assert [ax.get_xlabel() for ax in axes[1::2]] == ["finite elements", *(n for n, _ in shown)]
+    assert [bar.get_xlabel() for bar in figure.axes[8:]] == 3 * ["nodal error / L [-]"]
 
 
-@pytest.mark.parametrize("upright", [False, True])
-def test_texts_of_a_figure_neither_overlap_nor_leave_it(scene, batch, upright):
+def test_texts_of_a_figure_neither_overlap_nor_leave_it(scene, batch):
     truth = batch.displacement[:3]
     names = ["load 1, max displacement 0.4 L\nrelative L2 1.33 %: largest"] * 3
     shown = [("network", 0.9 * truth), ("linear", 1.1 * truth)]
-    figure = plot_deformed(scene.problem, truth, shown, names=names, upright=upright)
+    figure = plot_deformed(scene.problem, truth, shown, names=names)
     figure.draw_without_rendering()
     texts = [text for ax in figure.axes for text in (*ax.texts, ax.xaxis.label, ax.yaxis.label)]
     texts += [ax._left_title for ax in panels(figure)]
     places = {text: text.get_window_extent() for text in texts if text.get_text()}
     rows = [ax.get_position() for ax in panels(figure)]
-    if upright:
-        assert rows[0].y0 > rows[1].y0 > rows[2].y0, "one row per load"
-        assert rows[0].x0 < rows[3].x0 < rows[6].x0, "finite elements, then the predictions"
+    assert rows[0].y0 > rows[1].y0 > rows[2].y0, "one row per load"
+    assert rows[0].x0 < rows[3].x0 < rows[6].x0, "finite elements, then the predictions"
     assert len(places) == 3 + 3 + 2
     width, height = figure.canvas.get_width_height()
     for text, place in places.items():
@@ -79,7 +77,7 @@ def test_a_prediction_lies_within_its_panel_in_the_colours_of_its_error(scene, b
         assert left <= flat[:, 0].min() < flat[:, 0].max() <= right
         assert low <= flat[:, 1].min() < flat[:, 1].max() <= high
     assert not np.ptp(faces(figure.axes[2]), axis=0).any(), "all polygons have the same colour"
-    assert figure.axes[-1].get_yscale() == "linear", "errors of similar size"
+    assert figure.axes[-1].get_xscale() == "linear", "errors of similar size"
 
 
 def test_a_prediction_that_is_not_finite_is_left_out(scene, batch):
@@ -99,15 +97,14 @@ def test_nodes_with_larger_errors_are_brighter(make_scene, background):
     end = scene.problem.points[:, 0] == scene.problem.points[:, 0].max()
     wrong = truth + background + 0.1 * end[:, None]
     figure = plot_deformed(scene.problem, truth, [("network", wrong)])
-    assert figure.axes[-1].get_yscale() == ("log" if background else "linear")
+    assert figure.axes[-1].get_xscale() == ("log" if background else "linear")
     touched = end.numpy()[surface(scene.problem.mesh)].any(axis=1)
     light = faces(figure.axes[1])[:, :3] @ [0.3, 0.6, 0.1]
     assert touched.sum() == 2
     assert light[touched].min() > light[~touched].max() + 0.3
 
 
-@pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
-@pytest.mark.parametrize("most", [1000, 300, 100])
+@pytest.mark.parametrize(("cell", "most"), [("hexahedron", 1000), ("tetra", 300), ("tetra", 100)])
 def test_a_coarse_body_has_at_most_the_requested_polygons_and_keeps_its_extent(cell, most):
     mesh = box([4.0, 2.0, 1.0], [17, 9, 5], cell)
     points, polygons = mesh.p.T, surface(mesh)
@@ -123,12 +120,10 @@ def test_a_coarse_body_has_at_most_the_requested_polygons_and_keeps_its_extent(c
 
 def test_colours_become_brighter_over_three_decades():
     error = np.array([0.0, 1e-6, 1e-3, 1e-2, 1e-1, 1.0])
-    found = error_colours(error)
-    light = found @ [0.3, 0.6, 0.1]
-    assert found.dtype == np.uint8
+    light = error_scale(error).to_rgba(error, bytes=True)[:, :3] @ [0.3, 0.6, 0.1]
     assert light[0] == light[1] == light[2]
     assert (np.diff(light[2:]) > 20).all()
-    assert (error_colours(np.zeros(3)) == error_colours(np.zeros(3))[0]).all()
+    assert not np.ptp(error_scale(np.zeros(3)).to_rgba(np.zeros(3)), axis=0).any()
 
 
 def test_errors_are_plotted_against_displacement_and_as_a_distribution():

@@ -22,20 +22,14 @@ class AveragedWeights(L.Callback):
 
     Source: Polyak, Juditsky (1992), SIAM J. Control Optim. 30; the rising decay is that of
     TensorFlow's ExponentialMovingAverage.
-
-    Attributes:
-        decay: Largest d.
-        steps: Number of optimiser steps that the average contains.
-        average: The averages by the names of the weights; empty before the training.
     """
 
     def __init__(self, *, decay: float = 0.999) -> None:
         """Choose the decay."""
         if not 0 <= decay < 1:
             raise ValueError(f"decay = {decay} must be 0 or more and less than 1")
-        self.decay = decay
-        self.steps = 0
-        self.average: dict[str, Tensor] = {}
+        self.decay, self.steps = decay, 0
+        self.average: dict[str, Tensor] = {}  # by the names of the weights
         self._weights: dict[str, nn.Parameter] = {}
         self._restored: dict[str, Tensor] = {}  # weights of a resumed run
         self._last_step = 0
@@ -75,10 +69,6 @@ class AveragedWeights(L.Callback):
         """Leave the average in the module."""
         self._swap()
         self.average, self._weights = {}, {}
-
-    def replace_weights(self, checkpoint: dict[str, Any]) -> None:
-        """Replace the weights in a checkpoint by the average; `Surrogate` calls it."""
-        checkpoint["state_dict"] = {**checkpoint["state_dict"], **self.average}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of steps and the weights without averaging."""

@@ -18,18 +18,12 @@ class SkipNonFiniteGradients(L.Callback):
 
     Every infinite or NaN sample, loss or gradient makes the gradient norm non-finite, and a step
     with it would make all weights NaN. The number of skipped steps is logged as `skipped_steps`.
-
-    Attributes:
-        patience: Number of consecutive skipped steps that stops the training.
-        skipped_steps: Number of skipped steps so far.
     """
 
     def __init__(self, *, patience: int = 20) -> None:
         """Choose the number of consecutive skipped steps that stops the training."""
         check_range(1, patience=patience)
-        self.patience = patience
-        self.skipped_steps = 0
-        self._consecutive = 0
+        self.patience, self.skipped_steps, self._consecutive = patience, 0, 0
 
     def on_before_optimizer_step(
         self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer

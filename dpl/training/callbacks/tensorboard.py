@@ -29,16 +29,12 @@ class LogHyperparameters(L.Callback):
     TensorBoard's HPARAMS tab lists a run from its first step on. An interrupted run keeps the state
     "running", a diverged run has failed, an evaluated run (`finish`) has succeeded. A resumed run
     continues the same curves.
-
-    Attributes:
-        hyperparameters: Flat mapping of names to numbers, truth values and strings.
-        begun: Whether an epoch has begun in this session.
     """
 
     def __init__(self, hyperparameters: Mapping[str, bool | int | float | str]) -> None:
-        """Store the hyperparameters."""
+        """Take a flat mapping of names to hyperparameters."""
         self.hyperparameters = dict(hyperparameters)
-        self.begun = False
+        self.begun = False  # True after an epoch has begun in this session
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Record that the checkpoint of a resumed run has been restored."""

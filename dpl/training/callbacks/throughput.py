@@ -2,14 +2,12 @@
 
 import os
 import time
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
-from torch import Tensor
 
 from dpl.data import DataModule
 from dpl.system.files import append_jsonl
@@ -32,12 +30,7 @@ class ThroughputMonitor(L.Callback):
         self._mark = time.perf_counter()
 
     def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Sequence[Tensor],
-        batch_idx: int,
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, *_: Any
     ) -> None:
         """Add the samples and the time of a batch."""
         now = time.perf_counter()

@@ -1,7 +1,7 @@
 """Write pictures and meshes of the validation loads with the largest errors for TensorBoard."""
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import lightning as L
 import numpy as np
@@ -14,10 +14,8 @@ from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.training.callbacks.tensorboard import last_step, tensorboard_writers
 from dpl.training.metrics import PerLoadErrors, largest_errors, relative_errors
-from dpl.visualization import error_colours, plot_deformed, plot_errors
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from dpl.visualization import plot_deformed, plot_errors
+from dpl.visualization.shapes import error_scale
 
 REFERENCE_GREY = 160  # of reference shapes, 0 to 255
 MESH_STYLE = {  # three.js options of meshes in the browser
@@ -49,16 +47,13 @@ class WorstCasePlots(L.Callback):
             max_polygons: Maximum number of polygons of a surface; larger meshes are coarsened.
         """
         check_range(1, every=every, loads=loads, max_polygons=max_polygons)
-        self.loads = loads
-        self.meshes = meshes
-        self.max_polygons = max_polygons
+        self.loads, self.meshes, self.max_polygons = loads, meshes, max_polygons
         self._validations, self._next, self._drawn_step = 0, every, -1
         self._start = self._drawing_time = 0.0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Start the clock."""
-        self._start = time.perf_counter()
-        self._drawing_time = 0.0
+        self._start, self._drawing_time = time.perf_counter(), 0.0
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         """Count validations and draw when the count reaches the next picture."""
@@ -90,39 +85,33 @@ class WorstCasePlots(L.Callback):
         step = self._drawn_step = last_step(trainer)
         training, data = module.training, trainer.datamodule
         module.eval()
-        shapes, errors, mesh = self._pictures(module, data.samples("val"), data.batch_size)
+        samples = data.samples("val")
+        errors = per_sample_errors(module, samples, data.batch_size)
+        selected = errors.select(self.loads)
+        some = Sample(*(column[selected] for column in samples))
+        predicted = _predict(module, some)
         module.train(training)
+        shapes = plot_deformed(
+            module.scene.problem,
+            some.displacement,
+            [("", predicted)],
+            names=[errors.title(load) for load in selected],
+            max_polygons=self.max_polygons,
+        )
+        distribution = plot_errors(errors.relative, errors.size, selected)
+        worst, mesh = int(torch.nan_to_num(errors.largest[selected], nan=torch.inf).argmax()), None
+        pair = predicted[worst], some.displacement[worst]
+        if self.meshes and pair[0].isfinite().all():
+            mesh = side_by_side_mesh(module.scene, *pair, self.max_polygons)
         for writer in writers:
             writer.add_figure("validation/shapes", shapes, step)
-            writer.add_figure("validation/errors", errors, step)
+            writer.add_figure("validation/errors", distribution, step)
             if mesh:
                 writer.add_mesh("validation/worst", **mesh, global_step=step)
         self._drawing_time += time.perf_counter() - start
         fraction = self._drawing_time / (time.perf_counter() - self._start)
         for writer in writers:
             writer.add_scalar("time/pictures", fraction, step)
-
-    def _pictures(
-        self, module: Any, samples: Sample, batch_size: int
-    ) -> tuple["Figure", "Figure", dict[str, Any] | None]:
-        """Return the figures of shapes and errors, and the mesh of the largest absolute error."""
-        errors = per_sample_errors(module, samples, batch_size)
-        selected = errors.select(self.loads)
-        some = Sample(*(column[selected] for column in samples))
-        predicted = _predict(module, some)
-        shapes = plot_deformed(
-            module.scene.problem,
-            some.displacement,
-            [("", predicted)],
-            names=[errors.title(load) for load in selected],
-            upright=True,
-            max_polygons=self.max_polygons,
-        )
-        worst = selected.index(errors.largest_absolute)
-        pair, mesh = (predicted[worst], some.displacement[worst]), None
-        if self.meshes and pair[0].isfinite().all():
-            mesh = side_by_side_mesh(module.scene, *pair, self.max_polygons)
-        return shapes, plot_errors(errors.relative, errors.size, selected), mesh
 
 
 def per_sample_errors(module: Any, samples: Sample, batch_size: int) -> PerLoadErrors:
@@ -141,15 +130,9 @@ def side_by_side_mesh(
 ) -> dict[str, Any]:
     """Return a mesh for TensorBoard: the predicted surface, and the reference surface below it.
 
-    Args:
-        scene: The scene of both displacements.
-        prediction: Displacements over L, (N, D) [-], finite.
-        reference: Displacements over L, (N, D) [-].
-        max_polygons: Maximum number of polygons, see `dpl.fem.postprocess.coarse`.
-
-    Returns:
-        Arguments of `SummaryWriter.add_mesh`: vertices (1, V, 3) [m], those of the prediction
-        first; colors (1, V, 3), 0 to 255; faces, triangles (1, F, 3); config_dict.
+    The displacements over L, (N, D), are finite. The result has the arguments of
+    `SummaryWriter.add_mesh`: vertices (1, V, 3) [m], those of the prediction first; colors
+    (1, V, 3), 0 to 255; faces, triangles (1, F, 3); config_dict.
     """
     points = scene.problem.points.cpu().numpy()
     polygons = coarse(points, surface(scene.problem.mesh), max_polygons)
@@ -161,9 +144,8 @@ def side_by_side_mesh(
         shape[:, : points.shape[1]] = scene.length * (points + field.cpu().numpy())[used]
         shapes.append(shape)
     error = np.linalg.norm(shapes[0] - shapes[1], axis=1)
-    paint = np.concatenate(
-        [error_colours(error), np.full((len(used), 3), REFERENCE_GREY, np.uint8)]
-    )
+    colours = error_scale(error).to_rgba(error, bytes=True)[:, :3]
+    paint = np.concatenate([colours, np.full_like(colours, REFERENCE_GREY)])
     both = np.concatenate(shapes)
     shapes[1][:, 1] -= 1.1 * np.ptp(both[:, 1])
     return {

@@ -19,17 +19,11 @@ class EnergyNormLoss(Loss):
 
     saves = ("no finite-element evaluation in training: K(0) is assembled once",)
 
-    def __init__(self, *, relative: bool = True, floor: float = 1e-2) -> None:
-        """Choose the weighting.
-
-        Args:
-            relative: Divide the error of each sample by the energy of its displacement; otherwise
-                by the mean energy of the batch.
-            floor: See `clamp_scale`; has no effect without `relative`.
-        """
+    def __init__(self, *, floor: float = 1e-2) -> None:
+        """Choose the floor, see `clamp_scale`."""
         super().__init__()
         check_range(0, 1, floor=floor)
-        self.relative, self.floor = relative, floor
+        self.floor = floor
         self._rest: RestStiffness | None = None
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
@@ -38,7 +32,7 @@ class EnergyNormLoss(Loss):
             fields = torch.cat([prediction - batch.displacement, batch.displacement])
             images = rest.product(fields, torch.cat([batch.parameters, batch.parameters]))
             error, size = (fields * images).sum(dim=(1, 2)).chunk(2)
-            size = clamp_scale(size, self.floor if self.relative else torch.inf)
+            size = clamp_scale(size, self.floor)
             slope = 2 * images[: len(prediction)] / size[:, None, None]
         return with_gradient(prediction, error / size, slope).mean()
 
@@ -64,11 +58,7 @@ class PotentialEnergyLoss(Loss):
     saves = ("no displacement of the data set in the loss: it is the potential energy",)
 
     def __init__(self, *, floor: float = 1e-2) -> None:
-        """Choose the weighting.
-
-        Args:
-            floor: See `clamp_scale`.
-        """
+        """Choose the floor, see `clamp_scale`."""
         super().__init__()
         check_range(0, 1, floor=floor)
         self.floor = floor
@@ -77,9 +67,8 @@ class PotentialEnergyLoss(Loss):
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         self._rest = rest = RestStiffness.of(physics.problem, self._rest)
         with torch.no_grad():
-            scale = clamp_scale(
-                rest.linear_strain_energy(batch.force, batch.parameters), self.floor
-            )
+            work = rest.linear_strain_energy(batch.force, batch.parameters)
+            scale = clamp_scale(work, self.floor)
             energy, slope, sound = potential_energy(prediction, batch.load, physics.problem, rest)
             if not sound.all():
                 image = rest.product(prediction, batch.parameters)

@@ -3,15 +3,13 @@
 Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.3.
 """
 
-import lightning as L
 import torch
 from torch import Tensor
 
 from dpl.fem.postprocess import tangent_product
 from dpl.scene import Sample
 from dpl.system.checks import check_range
-from dpl.training.losses.loss import Loss, LossContext, squared_error, with_gradient
-from dpl.training.losses.supervised import MSE
+from dpl.training.losses.loss import MSE, Loss, LossContext, squared_error, with_gradient
 
 MAX_RESIDUALS = 64  # samples whose residual norms are averaged
 
@@ -20,22 +18,18 @@ class LrStar(Loss):
     """L_r^* = error x ||R|| / ||Phi q_max||; the residual norm is a weight without gradient.
 
     As in the paper, the residual norm is averaged over the batch and scales the gradient of the
-    whole batch. With `per_sample` it also weights the samples of a batch relative to each other.
-    The error of the paper is the mean squared one. The mean of a large batch is that of at most
-    `MAX_RESIDUALS` of its samples.
+    whole batch. The error of the paper is the mean squared one. The mean residual norm of a large
+    batch is that of at most `MAX_RESIDUALS` of its samples.
     """
 
     saves = ("no backward pass through the residual: it is a constant weight",)
     dtype = torch.float32
 
-    def __init__(
-        self, *, error: MSE | None = None, per_sample: bool = False, limit: float | None = None
-    ) -> None:
+    def __init__(self, *, error: MSE | None = None, limit: float | None = None) -> None:
         """Choose the error and the weighting.
 
         Args:
             error: Error of displacements; None for `MSE()`.
-            per_sample: Weight each sample by its own residual norm, not by the mean of the batch.
             limit: Largest residual norm over the median of its batch; larger ones count as that.
                 None: no limit. Almost inverted elements have residuals that are thousands of times
                 larger than usual, so that a few batches dominate the momentum of an optimiser.
@@ -43,43 +37,30 @@ class LrStar(Loss):
         super().__init__()
         if limit is not None:
             check_range(1, limit=limit)
-        self.error, self.per_sample, self.limit = error or MSE(), per_sample, limit
+        self.error, self.limit = error or MSE(), limit
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        error = self.error.errors(prediction, batch)
-        stride = 1 if self.per_sample else -(-len(prediction) // MAX_RESIDUALS)
+        error = self.error(prediction, batch, physics)
+        stride = -(-len(prediction) // MAX_RESIDUALS)
         some = Sample(*(column[::stride] for column in batch))
         weight = residual_norm(prediction.detach()[::stride].double(), some, physics)
         if self.limit is not None:
             weight = weight.clamp(max=self.limit * weight.median())
-        weight = weight if self.per_sample else weight.mean()
-        self.terms = {"error": error.mean(), "residual": weight.mean()}
-        return (error * weight).mean()
+        self.terms = {"error": error, "residual": weight.mean()}
+        return error * weight.mean()
 
 
 class LrPlus(Loss):
-    """L_r^+ = MSE + weight ||R|| / ||Phi q_max||, differentiable through the residual.
+    """L_r^+ = MSE + weight ||R|| / ||Phi q_max||, differentiable through the residual."""
 
-    Attributes:
-        weight: Current factor on the residual [-].
-    """
+    def __init__(self, *, weight: float = 1.0) -> None:
+        """Choose the factor on the residual; the paper has 1.
 
-    def __init__(self, *, weight: float = 1.0, warmup_epochs: int = 0) -> None:
-        """Choose the factor on the residual.
-
-        Args:
-            weight: Final factor on the residual; the paper has 1.
-            warmup_epochs: Number of epochs in which the factor rises linearly from zero.
+        `BlendedLoss` from `MSE` to this loss is the same with a factor that rises from zero.
         """
         super().__init__()
-        check_range(0, weight=weight, warmup_epochs=warmup_epochs)
-        self._final, self._warmup = weight, warmup_epochs
-        self.weight = weight if warmup_epochs == 0 else 0.0
-
-    def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Set the weight of the epoch."""
-        if self._warmup:
-            self.weight = self._final * min(1.0, trainer.current_epoch / self._warmup)
+        check_range(0, weight=weight)
+        self.weight = weight
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         error = squared_error(prediction, batch).mean()
