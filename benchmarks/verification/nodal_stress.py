@@ -16,7 +16,7 @@ from benchmarks.verification.bodies import Array
 from benchmarks.verification.drawing import measured, panel
 from benchmarks.verification.report import Row, Section
 from dpl import fem
-from dpl.fem.postprocess import at_nodes, cauchy, von_mises
+from dpl.fem.postprocess import cauchy, von_mises
 
 LOAD = 1e-6  # traction and pressure over E [-]: small strains
 NU = 0.3
@@ -116,7 +116,10 @@ CASES: dict[str, tuple[Callable[..., Body], str, int, tuple[int, ...], float]] =
 }
 
 
-RECOVERIES = {"means of cells": mean_of_cells, "patch recovery": at_nodes}
+RECOVERIES = {
+    "means of cells": mean_of_cells,
+    "patch recovery": lambda problem, values: problem.recovery(values),
+}
 
 
 def nodal_stress(folder: Path) -> Section:
@@ -124,7 +127,7 @@ def nodal_stress(folder: Path) -> Section:
     rows, means, bodies = [], [], {}
     for name, (make, cell, degree, cells, bound) in CASES.items():
         bodies[name] = body = make(cells, cell, degree)
-        error, ratio = errors(body, at_nodes)
+        error, ratio = errors(body, RECOVERIES["patch recovery"])
         error_of_mean, ratio_of_mean = errors(body, mean_of_cells)
         title = f"{name}, {' × '.join(map(str, cells))}"
         rows += [
