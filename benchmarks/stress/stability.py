@@ -190,7 +190,7 @@ def hydrostatic_pressure(auditor: Auditor) -> Outcome:
     """Compress a cube of NHiso-k2; its largest pressure is kappa s^2 (1 - s^3) at s^3 = 2/5."""
     law = fem.NeoHookeanIsoK2(0.3)
     problem, unit = fixtures.cube(law, 1, (0, 1, 2))
-    limit, rows = float(law.bulk) * 0.4 ** (2 / 3) * 0.6, []
+    limit, rows = float(law.bulk_modulus) * 0.4 ** (2 / 3) * 0.6, []
     for name, newton in newton_variants(problem):
         solver = replace(newton, linear="superlu")
         below = auditor.solve(solver, problem, as_load(-0.99 * limit * unit))

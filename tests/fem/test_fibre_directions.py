@@ -64,13 +64,9 @@ def polar(mesh: skfem.Mesh, degree: int = 1) -> tuple[np.ndarray, np.ndarray, np
 
 
 def wall(**other) -> fem.LaplaceFibres:
-    options = {
-        "inner": fem.Tag("inner"),
-        "outer": fem.Tag("outer"),
-        "longitudinal": [0.0, 0.0, 2.0],
-        "inner_angle": INNER_ANGLE,
-        "outer_angle": OUTER_ANGLE,
-    }
+    options = {"longitudinal": [0.0, 0.0, 2.0]}
+    options |= {"inner": fem.Tag("inner"), "inner_angle": INNER_ANGLE}
+    options |= {"outer": fem.Tag("outer"), "outer_angle": OUTER_ANGLE}
     return fem.LaplaceFibres(**(options | other))
 
 
@@ -189,7 +185,7 @@ def test_law_takes_the_frames_of_its_directions():
 # ------------------------------------------------------------------ Laplace's equation
 
 
-@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
+@pytest.mark.parametrize("cell", ["quad", "triangle"])
 def test_angle_through_a_cylinder_follows_the_logarithm_of_the_radius(cell):
     """Laplace's equation between two radii has the solution ln(r/a) / ln(b/a)."""
     coarse, fine = (errors(quarter_cylinder(count, cell)) for count in (4, 8))
@@ -210,9 +206,9 @@ def test_a_wall_of_one_cell_has_directions_too():
 def test_directions_are_of_first_order_on_linear_meshes_and_of_second_on_curved_ones(cell):
     coarse, fine = (np.array(errors(quarter_cylinder(count, cell))) for count in (2, 4))
     assert (fine > 0.3 * coarse).all()
-    coarse, fine = (
-        np.array(errors(quarter_cylinder(count, cell, curved=True), 2)) for count in (2, 4)
-    )
+    assert fine[0] < 0.6 * coarse[0]
+    meshes = (quarter_cylinder(count, cell, curved=True) for count in (2, 4))
+    coarse, fine = (np.array(errors(mesh, 2)) for mesh in meshes)
     assert (fine < 0.3 * coarse).all()
     assert (fine < np.radians(0.3)).all()
 

@@ -90,36 +90,30 @@ FORBIDDEN = [  # suffix, content, message
     ("msh", GMSH4 + "$Nodes\n1 999999999999 1 1\n", "must hold one section"),
     ("msh", GMSH2 + "$Elements\n999999999999\n", "must hold one section"),
     ("msh", BINARY + struct.pack("4Q", 1, 10**12, 1, 10**12), "must hold one section"),
-]  # fmt: skip
-HOSTILE = [
-    ("vtu", LAUGHS + "<VTKFile>x</VTKFile>", "document type or entities"),
-    ("vtu", DEEP, DAMAGED),
-    ("vtu", DEEP + "</a>" * 10**5 + "</VTKFile>", DAMAGED),
-    ("xdmf", XDMF, "h5py|netCDF4|cannot be read"),
+    ("msh", GMSH2 + "$NodeData\n999999999\n", "must hold"),
     ("msh", GMSH2 + "$Nodes\n1000000\n1 0 0 0\n$EndNodes\n", DAMAGED),
     ("vtk", VTK + "UNSTRUCTURED_GRID\nPOINTS 99999999 double\n", DAMAGED),
     ("vtk", VTK + "UNSTRUCTURED_GRID\nCELL_TYPES 99999 double\n", DAMAGED),
-    ("vtk", VTK + "STRUCTURED_POINTS\nDIMENSIONS 9999 9999 9999\n", DAMAGED),
     ("su2", "NDIME= 3\nNPOIN= 999999999999\n", "cannot be read|holds no supported cells"),
+    ("dat", 'TITLE = "x"\nVARIABLES = "X"\n', "cannot be read"),
 ]  # fmt: skip
+HOSTILE = [
+    ("vtu", DEEP, DAMAGED),
+    ("vtu", DEEP + "</a>" * 10**5 + "</VTKFile>", DAMAGED),
+    ("xdmf", XDMF, "h5py|netCDF4|cannot be read"),
+    ("vtk", VTK + "STRUCTURED_POINTS\nDIMENSIONS 9999 9999 9999\n", DAMAGED),
+]
 
 
-def check_content(tmp_path, suffix: str, content: str | bytes, match: str) -> None:
-    """Assert that a file of this content is refused."""
+@pytest.mark.parametrize(
+    ("suffix", "content", "match"), [*HOSTILE, *FORBIDDEN], ids=itertools.count()
+)
+def test_hostile_files_are_refused(tmp_path, suffix, content, match, request):
+    if (suffix, content, match) not in HOSTILE:
+        request.getfixturevalue("in_process")
     path = tmp_path / f"hostile.{suffix}"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     refused(path, match)
-
-
-@pytest.mark.parametrize(("suffix", "content", "match"), HOSTILE, ids=itertools.count())
-def test_hostile_files_are_refused(tmp_path, suffix, content, match):
-    check_content(tmp_path, suffix, content, match)
-
-
-@IN_PROCESS
-@pytest.mark.parametrize(("suffix", "content", "match"), FORBIDDEN, ids=itertools.count())
-def test_files_with_forbidden_content_are_refused(tmp_path, suffix, content, match):
-    check_content(tmp_path, suffix, content, match)
 
 
 @IN_PROCESS
@@ -198,8 +192,19 @@ def test_the_vtu_of_the_bombs_is_good_without_one(tmp_path):
     assert read_mesh(path).nelements == 1
 
 
-def check_offsets(tmp_path, nodes: str, offsets: str, types: str) -> None:
-    """Assert that a cell of these numbers is refused."""
+@pytest.mark.parametrize(
+    ("nodes", "offsets", "types"),
+    [
+        ("0 1 2 3 4 5 6 7", "7", "12"),
+        ("0 1 2 3 4 5 6 7 7", "9", "12"),
+        ("0 1 2 3 4 5 6 7", "8", "11"),  # a voxel, which meshio leaves out
+        ("0 1 2 3 4 5 6 7", "8", "10"),  # the last four would make a tetrahedron
+        ("0 1 2 3 4 5 6 7", "1000000000", "7"),  # a polygon
+    ],
+)
+def test_offsets_must_fit_the_cells(tmp_path, nodes, offsets, types, request):
+    if types != "7":
+        request.getfixturevalue("in_process")
     path = tmp_path / "bad.vtu"
     here = packed(CORNERS.astype("<f8").tobytes())
     path.write_text(
@@ -208,29 +213,11 @@ def check_offsets(tmp_path, nodes: str, offsets: str, types: str) -> None:
     refused(path, "types or the offsets of its cells|more memory|damaged")
 
 
-@IN_PROCESS
-@pytest.mark.parametrize(
-    ("nodes", "offsets", "types"),
-    [
-        ("0 1 2 3 4 5 6 7", "7", "12"),
-        ("0 1 2 3 4 5 6 7 7", "9", "12"),
-        ("0 1 2 3 4 5 6 7", "8", "11"),  # a voxel, which meshio leaves out
-        ("0 1 2 3 4 5 6 7", "8", "10"),  # the last four would make a tetrahedron
-    ],
-)
-def test_offsets_must_fit_the_cells(tmp_path, nodes, offsets, types):
-    check_offsets(tmp_path, nodes, offsets, types)
-
-
-def test_a_polygon_of_a_thousand_million_nodes_is_refused(tmp_path):
-    check_offsets(tmp_path, "0 1 2 3 4 5 6 7", "1000000000", "7")
-
-
-@pytest.mark.parametrize("form", [{"data_format": "XML"}, {"data_format": "Binary"}])
-def test_xdmf_is_refused(tmp_path, form):
+def test_xdmf_is_refused(tmp_path):
     """Its data may lie in other files, and meshio reads it with h5py only."""
     pytest.importorskip("h5py")
-    refused(cube(tmp_path, "cube.xdmf", **form), "h5py, which is not read; convert it")
+    path = cube(tmp_path, "cube.xdmf", data_format="Binary")
+    refused(path, "h5py, which is not read; convert it")
 
 
 @pytest.mark.parametrize(
@@ -239,19 +226,13 @@ def test_xdmf_is_refused(tmp_path, form):
         # tables by the largest number: 16 GB
         ("a.msh", GMSH2 + "$Nodes\n1\n2000000000 0 0 0\n$EndNodes\n"
          "$Elements\n1\n1 15 0 2000000000\n$EndElements\n", ENDLESS),
-        # a list of as many texts
-        ("b.msh", GMSH2 + "$NodeData\n999999999\n", "must hold"),
         ("c.inp", "*NODE\n1,0,0,0\n*NSET,NSET=A,GENERATE\n1,2000000000,1\n", ENDLESS),
         ("d.mesh", "MeshVersionFormatted 2\nDimension 3\nRidges\n99999999999\n", ENDLESS),
-        # files without their end
         ("a.mdpa", "Begin Nodes\n", "longer than"),  # meshio looks for a node after the end
-        ("a.ele", "\n", "cannot be read"),
-        ("a.dat", 'TITLE = "x"\nVARIABLES = "X"\n', "cannot be read"),
     ],
 )  # fmt: skip
 def test_files_that_need_much_memory_or_time_are_refused(tmp_path, name, text, match, few_seconds):
     (tmp_path / name).write_text(text)
-    (tmp_path / "a.node").write_text("\n")
     refused(tmp_path / name, match)
 
 
@@ -332,20 +313,16 @@ def test_a_path_from_the_working_folder_is_found(tmp_path, monkeypatch):
 
 
 @IN_PROCESS
-@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e200"])
-def test_planar_nodes_have_a_finite_third_coordinate(tmp_path, value):
-    """No comparison with their distance from the plane holds of these."""
-    points = PATCH.astype(float)
-    points[2, 2] = float(value)
-    refused(write(tmp_path / "patch.vtu", points, triangle=FAN), "1 nodes are not finite.*: 2")
-
-
-@IN_PROCESS
-@pytest.mark.parametrize("value", [1e60, -1e308])
-def test_coordinates_whose_volumes_overflow_are_an_error(tmp_path, value, recwarn):
-    points = TWO_CUBES.astype(float)
-    points[3, 1] = value
-    refused(write(tmp_path / "bar.vtu", points, hexahedron=TWO_HEXES), "1 nodes are above .*: 3")
+@pytest.mark.parametrize(
+    ("value", "flaw"),
+    [("nan", "not finite"), ("-inf", "not finite"), ("1e60", "above"), ("-1e308", "above")],
+)
+def test_coordinates_without_a_volume_are_an_error(tmp_path, value, flaw, recwarn):
+    """NaN would pass a comparison of distances from the plane of a 2D mesh."""
+    flat, solid = PATCH.astype(float), TWO_CUBES.astype(float)
+    flat[2, 2] = solid[2, 1] = float(value)
+    refused(write(tmp_path / "a.vtu", flat, triangle=FAN), f"1 nodes are {flaw}.*: 2")
+    refused(write(tmp_path / "b.vtu", solid, hexahedron=TWO_HEXES), f"1 nodes are {flaw}.*: 2")
     assert not recwarn
 
 
@@ -382,21 +359,18 @@ def test_solid_cells_of_other_kinds_are_not_left_out(tmp_path, kind, nodes):
 
 @IN_PROCESS
 def test_many_nodes_in_one_place_are_told_without_listing_their_pairs(tmp_path):
-    """30,000 cubes in one place have 3.6 * 10^9 pairs of nodes."""
-    number = 30_000
+    """2,000 cubes in one place have 16 million pairs of nodes."""
+    number = 2000
     cells = np.arange(8)[[0, 1, 3, 2, 4, 5, 7, 6]] + 8 * np.arange(number)[:, None]
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float)
     path = write(tmp_path / "crowd.vtu", np.tile(corners, (number, 1)), hexahedron=cells)
-    with pytest.raises(ValueError, match="30000 nodes coincide in one place: 0, 8, 16"):
+    with pytest.raises(ValueError, match="2000 nodes coincide in one place: 0, 8, 16"):
         read_mesh(path)
 
 
 def test_sets_name_nodes_and_cells_that_there_are(tmp_path):
     mesh = box([2.0, 1.0, 1.0], [3, 2, 2], "tetra")
-    for sets in (
-        {"point_sets": {"a": np.array([-1, 3])}},
-        {"point_sets": {"a": np.array([0, 99])}},
-    ):
-        raw = meshio.Mesh(mesh.p.T, [("tetra", mesh.t.T)], **sets)
+    for nodes in ([-1, 3], [0, 99]):
+        raw = meshio.Mesh(mesh.p.T, [("tetra", mesh.t.T)], point_sets={"a": np.array(nodes)})
         with pytest.raises(ValueError, match="the set 'a' = "):
             to_mesh(raw)

@@ -9,7 +9,7 @@ import skfem
 import torch
 
 from dpl.fem import NeoHookeanLn, Plane, Problem, SaintVenantKirchhoff, box, fields, rectangle
-from dpl.fem.postprocess import at_nodes, cauchy
+from dpl.fem.postprocess import cauchy
 
 LAME, SHEAR = 0.3 / (1.3 * 0.4), 1 / 2.6  # of nu = 0.3, over E
 
@@ -69,7 +69,7 @@ def test_linear_fields_are_recovered_exactly(kind):
     at = torch.from_numpy(np.array(problem.basis.global_coordinates())).permute(1, 2, 0)
     values = torch.stack([at, -2 * at]) @ slope.T - 0.5  # (B, E, Q, 3)
     expected = torch.stack([problem.points, -2 * problem.points]) @ slope.T - 0.5
-    assert torch.allclose(at_nodes(problem, values), expected, atol=1e-11)
+    assert torch.allclose(problem.recovery(values), expected, atol=1e-11)
 
 
 def test_constant_fields_are_recovered_on_a_single_cell(kind):
@@ -79,7 +79,7 @@ def test_constant_fields_are_recovered_on_a_single_cell(kind):
     mesh = rectangle([1.0, 1.0], [2, 2], cell) if flat else box([1.0] * 3, [2, 2, 2], cell)
     problem = Problem.build(mesh.restrict([0]), NeoHookeanLn(0.3), degree=degree)
     constant = torch.full((1, 1, problem.dV.shape[1], 3), 2.5, dtype=torch.float64)
-    found = at_nodes(problem, constant)
+    found = problem.recovery(constant)
     assert found.shape == (1, problem.shape[0], 3)
     assert torch.allclose(found, found.new_tensor(2.5), atol=1e-13)
 
@@ -88,7 +88,7 @@ def test_in_one_layer_of_hexahedra_quadrature_points_determine_the_values():
     mesh = box([3.0, 1.0, 1.0], [4, 2, 2])
     problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), length=1.0)
     height = torch.from_numpy(np.array(problem.basis.global_coordinates())[2])[None]
-    assert torch.allclose(at_nodes(problem, height)[0], problem.points[:, 2], atol=1e-12)
+    assert torch.allclose(problem.recovery(height)[0], problem.points[:, 2], atol=1e-12)
 
 
 def test_recovery_does_not_smear_across_a_slit():
@@ -102,7 +102,7 @@ def test_recovery_does_not_smear_across_a_slit():
     half = len(problem.cells) // 2
     values = torch.ones(1, 2 * half, 1, dtype=torch.float64)
     values[:, half:] = 7.0
-    found = at_nodes(problem, values)[0]
+    found = problem.recovery(values)[0]
     nodes = parts[0].p.shape[1]
     assert torch.allclose(found[:nodes], found.new_tensor(1.0), atol=1e-12)
     assert torch.allclose(found[nodes:], found.new_tensor(7.0), atol=1e-12)
@@ -117,8 +117,8 @@ def test_recovery_has_derivatives():
     problem = body("quad", 1)
     values = torch.rand(2, len(problem.cells), 4, 3, dtype=torch.float64, requires_grad=True)
     with torch.inference_mode():
-        at_nodes(problem, values)  # makes the matrix
-    at_nodes(problem, values).sum().backward()
+        problem.recovery(values)  # makes the matrix
+    problem.recovery(values).sum().backward()
     matrix = torch.from_numpy(problem.recovery.matrix.sum(axis=0))
     assert torch.allclose(values.grad, matrix.reshape(1, -1, 4, 1).expand_as(values), atol=1e-13)
 

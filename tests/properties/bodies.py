@@ -30,36 +30,21 @@ def logarithmic(low: float, high: float) -> st.SearchStrategy[float]:
 
 @dataclass(frozen=True)
 class Body:
-    """A cuboid on a grid, described so that it can be turned, moved, made larger and built anew.
-
-    Attributes:
-        cell, degree: The element.
-        law: The law.
-        support: What holds it, one of `HELD`, or "free".
-        sides: Over its size, (D,).
-        counts: Vertices along each side.
-        grading: Power of each coordinate, from 0 to 1, by which the grid is no longer even.
-        shaken: By which part of their distance inner vertices move at most.
-        mean_dilatation: See `Problem`.
-        size: Its unit of length [m].
-        turned: Seed of its rotation; 0: not turned.
-        shift: How far it is from the origin, over its size.
-        seed: Of what else is random.
-    """
+    """A cuboid on a grid, described so that it can be turned, moved, made larger and built anew."""
 
     cell: str
     degree: int
     law: fem.Material
-    support: str
-    sides: tuple[float, ...]
-    counts: tuple[int, ...]
-    grading: tuple[float, ...]
-    shaken: float
+    support: str  # one of `HELD`, or "free"
+    sides: tuple[float, ...]  # over its size, (D,)
+    counts: tuple[int, ...]  # of vertices along each side
+    grading: tuple[float, ...]  # powers of the coordinates, from 0 to 1
+    shaken: float  # largest motion of inner vertices over their distance
     mean_dilatation: bool
-    size: float
-    turned: int
-    shift: float
-    seed: int
+    size: float  # unit of length [m]
+    turned: int  # seed of the rotation; 0: not turned
+    shift: float  # distance from the origin, over the size
+    seed: int  # of the rest that is random
 
     @property
     def dim(self) -> int:
@@ -124,17 +109,10 @@ class Body:
 
 @dataclass(frozen=True)
 class Push:
-    """A load of one kind, turned as its body is.
+    """A load of one kind, turned as its body is."""
 
-    Attributes:
-        kind: "noise" on all nodes, at one "point", "traction" on a side, "weight", or "squeeze":
-            pressure on the end, towards the held one.
-        size: Largest displacement of its linear solution over L.
-        seed: Of what is random.
-    """
-
-    kind: str
-    size: float
+    kind: str  # noise, at one point, traction on a side, weight, or squeeze: pressure on the end
+    size: float  # largest displacement of its linear solution over L
     seed: int
 
     def on(self, body: Body, linear: fem.LinearSolver) -> fem.Load:
@@ -180,12 +158,7 @@ def rotation(dim: int, seed: int) -> Tensor:
 
 @st.composite
 def laws(draw, finite: bool = False) -> fem.Material:
-    """Draw any law with constants for which it resists shear and pressure at rest.
-
-    Args:
-        draw: Hypothesis'.
-        finite: Not the one law of small strains.
-    """
+    """Draw any law (or `finite`: of large strains) that resists shear and pressure at rest."""
     kinds = [kind for kind in HOOKEAN if not (finite and kind is fem.LinearElastic)]
     kind = draw(st.sampled_from([*kinds, fem.MooneyRivlinK2, fem.YeohK2, fem.OgdenK2]))
     if kind in HOOKEAN:
@@ -205,18 +178,8 @@ def laws(draw, finite: bool = False) -> fem.Material:
 
 
 @st.composite
-def bodies(
-    draw,
-    supports: tuple[str, ...] = HELD,
-    law: st.SearchStrategy[fem.Material] | None = None,
-) -> Body:
-    """Draw a body of less than 130 nodes.
-
-    Args:
-        draw: Hypothesis'.
-        supports: What may hold it.
-        law: Any if left out.
-    """
+def bodies(draw, supports: tuple[str, ...] = HELD, law: st.SearchStrategy | None = None) -> Body:
+    """Draw a body of less than 130 nodes with one of the supports and any law, or a given one."""
     cell, degree = draw(st.sampled_from(sorted(CUBOID))), draw(st.integers(1, 2))
     dim = 3 if CUBOID[cell] is fem.box else 2
     support = draw(st.sampled_from(supports))
@@ -246,13 +209,7 @@ def bodies(
 
 @st.composite
 def pushes(draw, body: Body, low: float = 1e-9, high: float = 10.0) -> Push:
-    """Draw a load that the supports of a body leave something to do.
-
-    Args:
-        draw: Hypothesis'.
-        body: What it acts on.
-        low, high: Bounds of its linear solution over L.
-    """
+    """Draw a load that moves a body; its linear solution over L lies between two bounds."""
     kinds = ["noise", "point", "weight"]
     if body.support not in ("clamps", "moved") or body.counts[0] > 2:
         kinds.append("traction")

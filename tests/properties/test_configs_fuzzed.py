@@ -8,7 +8,8 @@ import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from copy import deepcopy
-from functools import cache
+from functools import cache, reduce
+from operator import getitem
 from pathlib import Path
 
 import hydra
@@ -32,8 +33,7 @@ BLADES = ["mesh=propeller", "mesh.cells=[1,1,1,2,3]", "fixed=cylinder", "fixed.r
 SMALL = ["data.train=4", "data.val=2", "data.test=2", "data.batch_size=2", "data.workers=0"]
 DRAWN = ["loads=modal_small", "loads.radius.low=0.1"]
 HELD = [
-    "+supports.end={_target_: dpl.fem.DirichletBC, "
-    "value: [0.0, null, null], "
+    "+supports.end={_target_: dpl.fem.DirichletBC, value: [0.0, null, null], "
     "region: {_target_: dpl.fem.Plane, axis: 0, at: max}}",
     "+supports.soil={_target_: dpl.fem.RobinBC, stiffness: 45.0, "
     "region: {_target_: dpl.fem.Box, lower: [0, 0, 0], upper: [50, 25, 0]}}",
@@ -115,16 +115,8 @@ def places(node, path: tuple = ()) -> Iterator[tuple]:
             yield from places(value, (*path, key))
 
 
-def put(node, path: tuple, value) -> None:
-    for key in path[:-1]:
-        node = node[key]
-    node[path[-1]] = value
-
-
 def at(node, path: tuple):
-    for key in path:
-        node = node[key]
-    return node
+    return reduce(getitem, path, node)
 
 
 @st.composite
@@ -133,11 +125,8 @@ def harmed(draw):
     name = draw(st.sampled_from(list(bases())))
     cfg = deepcopy(bases()[name])
     path = draw(st.sampled_from(list(places(cfg))))
-    done = draw(
-        st.sampled_from(
-            ["kind", "number", "number", "number", "endless", "unfinished", "less", "more"]
-        )
-    )
+    changes = ["kind", "number", "number", "number", "endless", "unfinished", "less", "more"]
+    done = draw(st.sampled_from(changes))
     old = at(cfg, path)
     if done == "less":
         parent = at(cfg, path[:-1])
@@ -146,10 +135,8 @@ def harmed(draw):
     if done == "more":
         while not isinstance(at(cfg, path), dict):
             path = path[:-1]
-        path = (
-            *path,
-            draw(st.sampled_from(["colour", "speed", "_args_", "_colour_", "memori_limit"])),
-        )
+        names = ["colour", "speed", "_args_", "_colour_", "memori_limit"]
+        path = (*path, draw(st.sampled_from(names)))
         value = draw(st.sampled_from([1, "red", [1], {}, {"_target_": "builtins.dict"}]))
     else:
         choices = {"kind": OTHER_KINDS, "number": NUMBERS, "endless": ENDLESS}
@@ -157,7 +144,7 @@ def harmed(draw):
         value = draw(st.sampled_from(choices.get(done, (*UNFINISHED, *loops))))
         if done == "number" and draw(st.booleans()) and isinstance(old, int | float):
             value = type(value)(value)
-    put(cfg, path, value)
+    at(cfg, path[:-1])[path[-1]] = value
     return name, cfg, path, done, value
 
 
@@ -257,18 +244,18 @@ def _names() -> list[str]:
 NAMES = _names()
 
 KINDS = {
+    *("Mesh", "Material", "Newton", "LoadFamily", "DataSet", "DataModule", "Module", "Optimizer"),
     *(
-        "Mesh",
-        "Material",
-        "Newton",
-        "LoadFamily",
-        "DataSet",
-        "DataModule",
-        "Module",
-        "Optimizer",
         "Source",
+        "LRScheduler",
+        "Plane",
+        "Box",
+        "Sphere",
+        "Cylinder",
+        "Tag",
+        "DirichletBC",
+        "RobinBC",
     ),
-    *("LRScheduler", "Plane", "Box", "Sphere", "Cylinder", "Tag", "DirichletBC", "RobinBC"),
     *("Traction", "BodyForce", "FollowerPressure", "ActiveStress", "Loss"),
     *("CellField", "FibreEnergy", "FibreDirections", "ReferenceSolver"),
 }
@@ -280,10 +267,11 @@ FUNCTIONS = {  # they compute a mesh, an array or a schedule and have no other e
 }
 
 
+PARTS = st.sampled_from(["mesh", "loss", "trainer", "callbacks.x", "logger.x"])
+
+
 @at_most(10)
-@given(
-    st.sampled_from(NAMES), st.sampled_from(["mesh", "loss", "trainer", "callbacks.x", "logger.x"])
-)
+@given(st.sampled_from(NAMES), PARTS)
 def test_what_a_runs_folder_may_name_is_of_a_kind_that_a_run_is_made_of(name, key):
     """Whatever else our modules have imported, functions with a reach of their own included."""
     cfg = OmegaConf.create({"trainer": {"_target_": "lightning.Trainer"}})

@@ -6,6 +6,8 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from copy import deepcopy
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,10 +29,7 @@ SIZES = {"train": 12, "val": 4, "test": 4}
 ALONE = (10, 11)  # loads of training whose files are not merged
 SHARDS = ["train-000000", "train-000004", "train-000008", "val-000000", "test-000000"]
 SHARDS += [f"train-{number:06d}" for number in ALONE]
-FILES = [
-    *("scene.json", "journal.jsonl"),
-    *(f"{name}.safetensors" for name in SHARDS),
-]
+FILES = ["scene.json", "journal.jsonl", *(f"{name}.safetensors" for name in SHARDS)]
 REMEDIES = ("action=repair", "data.folder", "data.seed", "remove", "generate")
 
 
@@ -122,21 +121,15 @@ def law(scene, folder: Path, written: dict, *, trusts_digests: bool = True) -> N
 # ------------------------------------------------------------------ bytes
 
 BYTES = st.binary(min_size=1, max_size=12)
+WAYS = ["flip", "flip", "cut", "remove", "repeat", "insert", "zero", "empty", "delete", "swap"]
+WAYS += ["folder", "pipe", "loop", "outside", "endless", "huge", "deep"]
 
 
 @st.composite
 def blows(draw):
     """Return a damage: name of a file and parameters."""
     name = draw(st.sampled_from(FILES))
-    how = draw(
-        st.sampled_from(
-            [
-                *("flip", "flip", "cut", "remove", "repeat", "insert", "zero", "empty"),
-                *("delete", "swap", "folder", "pipe", "loop", "outside", "endless", "huge"),
-                "deep",
-            ]
-        )
-    )
+    how = draw(st.sampled_from(WAYS))
     place = draw(st.floats(0, 1)), draw(st.floats(0, 0.3))
     return name, how, place, draw(st.sampled_from(FILES)), draw(BYTES), draw(st.integers(0, 7))
 
@@ -219,15 +212,12 @@ def test_a_text_file_with_arbitrary_values_gives_the_samples_or_an_error(scene, 
     name = data.draw(st.sampled_from(["scene.json", "journal.jsonl"]))
     with copied(sound.folder) as folder:
         text = (folder / name).read_text()
-        lines = (
-            [json.loads(text)] if name == "scene.json" else list(map(json.loads, text.splitlines()))
-        )
+        texts = [text] if name == "scene.json" else text.splitlines()
+        lines = list(map(json.loads, texts))
         for _ in range(data.draw(st.integers(1, 2))):
             path = data.draw(st.sampled_from(list(entries(lines))))
             value = data.draw(st.sampled_from([*VALUES, ABSENT, "twice"]))
-            node = lines
-            for key in path[:-1]:
-                node = node[key]
+            node = reduce(getitem, path[:-1], lines)
             if value is ABSENT:
                 del node[path[-1]]
             elif value == "twice" and isinstance(node, list):

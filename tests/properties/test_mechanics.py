@@ -65,13 +65,7 @@ def check_same(problem: fem.Problem, load: fem.Load, found: Tensor, expected: Te
 # ---------------------------------------------------------------- energy, force, tangent
 
 
-@given(
-    body=bodies(FREE, laws(finite=True)),
-    steepness=steepnesses,
-    seed=seeds,
-    turn=seeds,
-    shift=st.floats(-3, 3),
-)
+@given(bodies(FREE, laws(finite=True)), steepnesses, seeds, seeds, st.floats(-3, 3))
 def test_turned_and_moved_body_stores_as_much_and_feels_turned_forces(
     body, steepness, seed, turn, shift
 ):
@@ -186,10 +180,8 @@ def check_states(newton: fem.Newton, load: fem.Load, states: list[fem.Solution])
         assert last.status == fem.Status.NO_VALID_EQUILIBRIUM
     assert (torch.where(problem.free, 0.0, u) - factor * problem.prescribed).abs().max() <= 1e-12
     if factor:
-        internal = problem.evaluate(u).internal
-        assert problem.is_equilibrium(
-            u, internal, factor * load.force, newton.intermediate_tol
-        ).item()
+        internal, part = problem.evaluate(u).internal, factor * load.force
+        assert problem.is_equilibrium(u, internal, part, newton.intermediate_tol).item()
     else:
         assert not u.any()
 
@@ -270,10 +262,7 @@ def test_answer_turns_with_body_supports_and_load(case, turn, shift):
     body, push = case
     assume(body.support != "rollers")
     turned = replace(body, turned=turn, shift=shift)
-    first, second = (
-        fem.Newton(body.build(), max_total_iter=60),
-        fem.Newton(turned.build(), max_total_iter=60),
-    )
+    first, second = (fem.Newton(one.build(), max_total_iter=60) for one in (body, turned))
     load = push.on(body, first.linear_solver)
     answer = fem.solve(first, load)
     assume(answer.stable.all())

@@ -4,38 +4,27 @@ import ast
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
+EXPECTING = {"raises", "warns", "fail", "run_state_machine_as_test"}
 
 
-def functions(tree):
-    return [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-
-
-def asserts(function, helpers):
-    """Whether a function asserts, expects an exception or calls one of the helpers that do."""
-    for node in ast.walk(function):
-        if isinstance(node, ast.Assert):
-            return True
-        if isinstance(node, ast.Call):
-            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
-            if name in {
-                "raises",
-                "warns",
-                "fail",
-                "run_state_machine_as_test",
-            } | helpers or name.startswith("assert_"):
-                return True
-    return False
+def facts(function):
+    """Return name, whether a function itself asserts or expects an error, and what it calls."""
+    nodes = list(ast.walk(function))
+    called = [node.func for node in nodes if isinstance(node, ast.Call)]
+    calls = {getattr(name, "attr", getattr(name, "id", "")) for name in called}
+    checks = any(name in EXPECTING or name.startswith("assert_") for name in calls)
+    return function.name, checks or any(isinstance(node, ast.Assert) for node in nodes), calls
 
 
 def silent(tree):
     """Return the names of the tests of a module that assert nothing."""
+    known = [facts(node) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     helpers, before = set(), None
     while helpers != before:
         before = helpers
-        helpers = {f.name for f in functions(tree) if asserts(f, before)}
-        helpers = {name for name in helpers if not name.startswith("test_")}
-    tests = (f for f in functions(tree) if f.name.startswith("test_"))
-    return [test.name for test in tests if not asserts(test, helpers)]
+        asserting = {name for name, checks, calls in known if checks or calls & before}
+        helpers = {name for name in asserting if not name.startswith("test_")}
+    return [name for name, *_ in known if name.startswith("test_") and name not in asserting]
 
 
 def test_a_test_that_asserts_nothing_is_found():

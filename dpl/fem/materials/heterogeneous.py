@@ -1,6 +1,6 @@
 """Bodies of several laws: each region of cells has its own."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self, cast
@@ -13,18 +13,16 @@ from torch import Tensor
 from dpl.fem.identity import plain
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import Material, Response
-from dpl.fem.materials.parameters import Composed
 from dpl.fem.mesh.regions import Origin, Region, Tag, cells_in
 
 OTHER = "other"  # region of the cells that belong to no other region
 
 
 @dataclass(frozen=True, eq=False)
-class Heterogeneous(Composed, Material):
-    """Laws of the regions of a body.
+class Heterogeneous(Material):
+    """Laws of the regions of a body, which are its parts.
 
-    A parameter of a law has the name of its region before its own: core.poisson. Cells with
-    isotropic laws of one class are evaluated together.
+    Cells with isotropic laws of one class are evaluated together.
 
     Attributes:
         laws: Law of each region, by name.
@@ -49,16 +47,15 @@ class Heterogeneous(Composed, Material):
 
     @property
     def finite(self) -> bool:  # type: ignore[override]
-        """False for laws of small strains."""
         return all(law.finite for law in self.laws.values())
 
     # ------------------------------------------------------------------ cells
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
-        """Return the laws of the cells of a body, see `Material.on`."""
         count = basis.mesh.nelements
         index = np.full(count, -1)
-        for k, name in enumerate(self.laws):
+        names = list(self.laws)
+        for k, name in enumerate(names):
             if name == OTHER and name not in self.regions:
                 continue
             region = self.regions.get(name) or Tag(name)
@@ -68,24 +65,37 @@ class Heterogeneous(Composed, Material):
                 remedy = "" if name in self.regions else f"; define regions.{name}"
                 raise ValueError(f"material.{name}: {error}{remedy}") from error
             if (twice := cells[index[cells] >= 0]).size:
-                both = f"{list(self.laws)[index[twice[0]]]} and {name}"
+                both = f"{names[index[twice[0]]]} and {name}"
                 raise ValueError(f"regions: {twice.size} cells belong to both {both}")
             index[cells] = k
-        if (free := np.flatnonzero(index < 0)).size and OTHER not in self.laws:
+        if (free := np.flatnonzero(index < 0)).size and OTHER not in names:
             raise ValueError(
                 f"regions: {free.size} of {count} cells belong to no region; add material.{OTHER}"
             )
-        if OTHER in self.laws and OTHER not in self.regions:
+        if OTHER in names and OTHER not in self.regions:
             if not free.size:
                 raise ValueError(f"material.{OTHER}: all cells belong to other regions; remove it")
-            index[free] = list(self.laws).index(OTHER)
-        bound = super().on(basis, length, origin)
-        layout = Layout.of(self.laws.values(), torch.from_numpy(index))
-        return replace(bound, layout=layout)
+            index[free] = names.index(OTHER)
+        return super().on(basis, length, origin)._with_layout(torch.from_numpy(index))
 
     def of_cells(self, cells: Tensor) -> Self:
-        layout = Layout.of(self.laws.values(), self._layout.law_of_cell[cells])
-        return replace(super().of_cells(cells), layout=layout)
+        return super().of_cells(cells)._with_layout(self._layout.law_of_cell[cells])
+
+    def _with_layout(self, law_of_cell: Tensor) -> Self:
+        """Return the laws with the number of the law of each cell, (E,)."""
+        numbers: dict[Any, list[int]] = {}
+        for k, law in enumerate(self.laws.values()):
+            if (law_of_cell == k).any():
+                key: Any = k
+                if isinstance(law, InvariantBasedMaterial):
+                    key = type(law), law.unit, *(getattr(law, name) is None for name in law.ranged)
+                numbers.setdefault(key, []).append(k)
+        groups = [
+            (own, torch.isin(law_of_cell, torch.tensor(own)).nonzero()[:, 0])
+            for own in numbers.values()
+        ]
+        order = torch.cat([cells for _, cells in groups]).argsort()
+        return replace(self, layout=Layout(law_of_cell, groups, order))
 
     @property
     def _layout(self) -> "Layout":
@@ -121,7 +131,7 @@ class Heterogeneous(Composed, Material):
 
     @property
     def young_at_rest(self) -> float:
-        """Young's modulus at rest of the softest law, see `Material.young_at_rest`."""
+        """Young's modulus at rest of the softest law."""
         return min(law.young_at_rest for law in self.laws.values())
 
     def describe(self) -> str:
@@ -134,22 +144,22 @@ class Heterogeneous(Composed, Material):
         return all(law.has_response for law in self.laws.values())
 
     def energy(self, H: Tensor) -> Tensor:
-        return self._of_all_cells(lambda law, H: law.energy(H), H)
+        return self._of_all_cells("energy", H)
 
     def volumetric_energy(self, j: Tensor) -> Tensor:
-        return self._of_all_cells(lambda law, j: law.volumetric_energy(j), j)
+        return self._of_all_cells("volumetric_energy", j)
 
     def pressure(self, j: Tensor) -> Tensor:
-        return self._of_all_cells(lambda law, j: law.pressure(j), j)
+        return self._of_all_cells("pressure", j)
 
     def stress(self, H: Tensor) -> Tensor:
-        return self._of_all_cells(lambda law, H: law.stress(H), H)
+        return self._of_all_cells("stress", H)
 
     def tangent(self, H: Tensor) -> Tensor:
-        return self._of_all_cells(lambda law, H: law.tangent(H), H)
+        return self._of_all_cells("tangent", H)
 
     def rest_stress(self, H: Tensor) -> Tensor:
-        return self._of_all_cells(lambda law, H: law.rest_stress(H), H)
+        return self._of_all_cells("rest_stress", H)
 
     def response(self, E: Tensor) -> Response:
         parts = [law.response(E[:, cells]) for law, cells in self._groups]
@@ -157,11 +167,11 @@ class Heterogeneous(Composed, Material):
         joined = (torch.cat(one, dim=1)[:, order] for one in zip(*parts, strict=True))
         return Response(*joined)
 
-    def _of_all_cells(self, of: Callable[[Material, Tensor], Tensor], H: Tensor) -> Tensor:
-        """Return a function of a law and H (B, E, Q, 3, 3) with the law of each cell."""
+    def _of_all_cells(self, quantity: str, strain: Tensor) -> Tensor:
+        """Return a quantity of the law of each cell, a method of strains (B, E, Q, ...)."""
         if len(self._groups) == 1:
-            return of(self._groups[0][0], H)
-        parts = [of(law, H[:, cells]) for law, cells in self._groups]
+            return getattr(self._groups[0][0], quantity)(strain)
+        parts = [getattr(law, quantity)(strain[:, cells]) for law, cells in self._groups]
         return torch.cat(parts, dim=1)[:, self._layout.order]
 
     @property
@@ -170,22 +180,20 @@ class Heterogeneous(Composed, Material):
 
     @property
     def mu(self) -> Tensor:
-        """Shear modulus at rest over Young's modulus of the cells, (E, 1) or (B, E, 1) [-]."""
-        return self._moduli(lambda law: law.mu)
+        return self._modulus("mu")
 
     @property
     def lam(self) -> Tensor:
-        """First Lame parameter at rest over Young's modulus, (E, 1) or (B, E, 1) [-]."""
-        return self._moduli(lambda law: law.lam)
+        return self._modulus("lam")
 
     @property
     def point_bulk(self) -> Tensor:
-        """Bulk modulus that stays at the points, (E, 1) or (B, E, 1) [-]."""
-        return self._moduli(lambda law: law.point_bulk)
+        return self._modulus("point_bulk")
 
-    def _moduli(self, of: Callable[[Material], Tensor]) -> Tensor:
-        index = self._layout.law_of_cell
-        return values_of_cells([of(law) for law in self.laws.values()], index)
+    def _modulus(self, name: str) -> Tensor:
+        """Return a modulus of the law of each cell, (E, 1) or (B, E, 1) [-]."""
+        values = [getattr(law, name) for law in self.laws.values()]
+        return values_of_cells(values, self._layout.law_of_cell)
 
 
 class Layout(NamedTuple):
@@ -198,23 +206,8 @@ class Layout(NamedTuple):
     """
 
     law_of_cell: Tensor
-    groups: tuple[tuple[list[int], Tensor], ...]
+    groups: list[tuple[list[int], Tensor]]
     order: Tensor
-
-    @classmethod
-    def of(cls, laws: Iterable[Material], index: Tensor) -> "Layout":
-        """Return the cells of laws, from the number of the law of each cell."""
-        numbers: dict[Any, list[int]] = {}
-        for k, law in enumerate(laws):
-            if (index == k).any():
-                key: Any = k
-                if isinstance(law, InvariantBasedMaterial):
-                    key = type(law), law.unit, *(getattr(law, name) is None for name in law.ranged)
-                numbers.setdefault(key, []).append(k)
-        groups = tuple(
-            (own, torch.isin(index, torch.tensor(own)).nonzero()[:, 0]) for own in numbers.values()
-        )
-        return cls(index, groups, torch.cat([cells for _, cells in groups]).argsort())
 
 
 def one_law(material: Material) -> Material:
@@ -225,12 +218,7 @@ def one_law(material: Material) -> Material:
 
 
 def values_of_cells(values: Sequence[Tensor], index: Tensor) -> Tensor:
-    """Return for each cell the value of its law, (E, 1) or (B, E, 1).
-
-    Args:
-        values: Constant of each law in all cells, (), (E, 1), (B, 1, 1) or (B, E, 1).
-        index: Number of the law of each cell, (E,).
-    """
+    """Return for each cell the value (E, 1) or (B, E, 1) of the law whose number is its index."""
     full = torch.broadcast_tensors(*values, torch.empty(len(index), 1))[:-1]
     return torch.stack(full, dim=-3)[..., index, torch.arange(len(index)), :]
 

@@ -12,6 +12,7 @@ from dpl.fem.materials.tensors import (
     invariants,
     inverse_transpose,
     symmetric_product,
+    trace,
     volume_change,
     with_axes,
 )
@@ -30,7 +31,6 @@ class InvariantBasedMaterial(Material):
 
     @property
     def compiled_form(self) -> CompiledForm:
-        """The law alone, without fibres."""
         return CompiledForm(self)
 
     @staticmethod
@@ -61,11 +61,9 @@ class InvariantBasedMaterial(Material):
     def _response(self, E: Tensor, j: Tensor) -> Response:
         """Return stress and moduli at strains E where J = 1 + j."""
         e = 2 * E
-        i1, second, square = invariants(e)
         eye = torch.eye(3, dtype=E.dtype, device=E.device)
-        X = inverse_transpose(e, square)
-        invariant_derivatives = self._invariant_derivatives(i1, 2 * i1 + second, j)
-        S = _stress(e, square, i1, invariant_derivatives)
+        i1, X = trace(e), inverse_transpose(e, volume_change(e))
+        S, invariant_derivatives = self._stress(e, j)
         _, W2, p, *curvatures = (with_axes(s, 4) for s in invariant_derivatives)
         W11, W12, W22, W1J, W2J, pJ = curvatures
         T1, T2 = 2 * eye.expand_as(e), 2 * ((2 + i1)[..., None, None] * eye - e)
@@ -80,29 +78,19 @@ class InvariantBasedMaterial(Material):
 
         J is that of H, with its sign: inverted, a law with ln J has no stress (NaN).
         """
-        e = 2 * green_lagrange(H)
-        i1, second, square = invariants(e)
-        invariant_derivatives = self._invariant_derivatives(i1, 2 * i1 + second, volume_change(H))
-        S = _stress(e, square, i1, invariant_derivatives)
+        S, _ = self._stress(2 * green_lagrange(H), volume_change(H))
         return S + H @ S
 
-    def _invariant_derivatives(
-        self, i1: Tensor, i2: Tensor, j: Tensor
-    ) -> tuple[Tensor | float, ...]:
+    def _stress(self, e: Tensor, j: Tensor) -> tuple[Tensor, tuple[Any, ...]]:
+        """Return S (..., 3, 3) at e = C - I where J = 1 + j, and the derivatives that make it."""
+        i1, second, square = invariants(e)
         log_j = torch.log1p(j)
         m1 = torch.expm1(-2 / 3 * log_j)
-        return self.invariant_derivatives(self.constants, i1, i2, j, log_j, m1)
-
-
-def _stress(
-    e: Tensor, square: Tensor, i1: Tensor, invariant_derivatives: tuple[Tensor | float, ...]
-) -> Tensor:
-    """Return S (..., 3, 3) at e = 2 E = C - I with det C = 1 + square."""
-    rest, W2, p = (with_axes(s, 2) for s in invariant_derivatives[:3])
-    eye = torch.eye(3, dtype=e.dtype, device=e.device)
-    S = (rest + 2 * W2 * i1[..., None, None]) * eye
-    if isinstance(W2, Tensor) or W2:
-        S = S - 2 * W2 * e
-    if isinstance(p, Tensor) or p:  # else a collapsed body, C singular, has a stress too
-        S = S - p * (e @ inverse_transpose(e, square))
-    return S
+        found = self.invariant_derivatives(self.constants, i1, 2 * i1 + second, j, log_j, m1)
+        rest, W2, p = (with_axes(s, 2) for s in found[:3])
+        S = (rest + 2 * W2 * i1[..., None, None]) * torch.eye(3, dtype=e.dtype, device=e.device)
+        if isinstance(W2, Tensor) or W2:
+            S = S - 2 * W2 * e
+        if isinstance(p, Tensor) or p:  # else a collapsed body, C singular, has a stress too
+            S = S - p * (e @ inverse_transpose(e, square))
+        return S, found

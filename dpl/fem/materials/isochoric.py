@@ -57,18 +57,15 @@ def isochoric_invariants(H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     log_j = torch.log1p(j)
     m, n = torch.exp(-2 / 3 * log_j), torch.exp(-4 / 3 * log_j)
     i2 = 2 * i1 + second
-    return (
-        m * i1 + 3 * torch.expm1(-2 / 3 * log_j),
-        n * i2 + 3 * torch.expm1(-4 / 3 * log_j),
-        j,
-    )
+    x, y = m * i1 + 3 * torch.expm1(-2 / 3 * log_j), n * i2 + 3 * torch.expm1(-4 / 3 * log_j)
+    return x, y, j
 
 
 class PolynomialMaterial(InvariantBasedMaterial):
     """Law c10 x + c20 x^2 + c30 x^3 + c01 y + bulk/2 (J - 1)^2, x = Ib1 - 3 and y = Ib2 - 3.
 
-    Its `constants` are c10, c20, c30, c01 and bulk over E [-]. The shear modulus at rest is
-    2 (c10 + c01). The volumetric term is that of Abaqus (D1 = 2/bulk).
+    Its `constants` are c10, c20, c30, c01 and bulk over E [-]. The volumetric term is that of
+    Abaqus (D1 = 2/bulk).
     """
 
     def energy(self, H: Tensor) -> Tensor:
@@ -83,16 +80,34 @@ class PolynomialMaterial(InvariantBasedMaterial):
         return polynomial_derivatives(c, i1, i2, m1, k2_derivatives(c[4], j))
 
 
+class PolynomialK2(BulkOrPoisson, PolynomialMaterial):
+    """Law in which some of c10, c20, c30 and c01 are constants, and the others are zero."""
+
+    @property
+    def _moduli(self) -> tuple[Tensor, ...]:
+        """Return c10, c20, c30 and c01."""
+        names, zero = ("c10", "c20", "c30", "c01"), 0 * self.value("c10")
+        return tuple(self.value(name) if name in self.ranged else zero for name in names)
+
+    @property
+    def mu(self) -> Tensor:
+        c10, _, _, c01 = self._moduli
+        return 2 * (c10 + c01)
+
+    @property
+    def constants(self) -> tuple[Tensor, ...]:
+        return *self._moduli, self.bulk_modulus
+
+
 @dataclass(frozen=True)
-class MooneyRivlinK2(BulkOrPoisson, PolynomialMaterial):
+class MooneyRivlinK2(PolynomialK2):
     """Mooney-Rivlin solid: c10 (Ib1 - 3) + c01 (Ib2 - 3) + bulk/2 (J - 1)^2.
 
-    Shear modulus at rest 2 (c10 + c01).
-
-    Source: Rivlin (1948); the volumetric term is that of Abaqus (D1 = 2/bulk).
+    Source: Rivlin (1948).
 
     Attributes:
-        c10, c01, bulk: Moduli in one unit; numbers, ranges [low, high] or fields.
+        c10, c01, bulk: Moduli in one unit; numbers, ranges [low, high] or fields. The shear
+            modulus at rest is 2 (c10 + c01).
         poisson: Poisson's ratio at rest [-], in place of `bulk`.
     """
 
@@ -105,23 +120,12 @@ class MooneyRivlinK2(BulkOrPoisson, PolynomialMaterial):
     bulk: Constant | None = None
     poisson: Constant | None = option("", default=None, above=-1.0, below=0.5, optional=True)
 
-    @property
-    def mu(self) -> Tensor:
-        """Shear modulus at rest over Young's modulus [-]."""
-        return 2 * (self.value("c10") + self.value("c01"))
-
-    @property
-    def constants(self) -> tuple[Tensor, ...]:
-        """Return c10, 0, 0, c01 and bulk."""
-        c10, c01 = self.value("c10"), self.value("c01")
-        return c10, 0 * c10, 0 * c10, c01, self.bulk_modulus
-
 
 @dataclass(frozen=True)
-class YeohK2(BulkOrPoisson, PolynomialMaterial):
+class YeohK2(PolynomialK2):
     """Yeoh's solid: c10 (Ib1 - 3) + c20 (Ib1 - 3)^2 + c30 (Ib1 - 3)^3 + bulk/2 (J - 1)^2.
 
-    Source: Yeoh (1993), Rubber Chem. Technol. 66; the volumetric term is that of Abaqus.
+    Source: Yeoh (1993), Rubber Chem. Technol. 66.
 
     Attributes:
         c10, c20, c30, bulk: Moduli in one unit; numbers, ranges [low, high] or fields. The shear
@@ -138,17 +142,6 @@ class YeohK2(BulkOrPoisson, PolynomialMaterial):
     c30: Constant
     bulk: Constant | None = None
     poisson: Constant | None = option("", default=None, above=-1.0, below=0.5, optional=True)
-
-    @property
-    def mu(self) -> Tensor:
-        """Shear modulus at rest over Young's modulus [-]."""
-        return 2 * self.value("c10")
-
-    @property
-    def constants(self) -> tuple[Tensor, ...]:
-        """Return c10, c20, c30, 0 and bulk."""
-        c10, c20, c30 = map(self.value, self.dimensional[:3])
-        return c10, c20, c30, 0 * c10, self.bulk_modulus
 
 
 @dataclass(frozen=True)
@@ -188,7 +181,6 @@ class DemirayK2(BulkOrPoisson, InvariantBasedMaterial):
 
     @property
     def mu(self) -> Tensor:
-        """Shear modulus at rest over Young's modulus [-]."""
         return self.value("a")
 
     @staticmethod

@@ -9,14 +9,7 @@ from torch import Tensor
 
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import YoungPoissonMaterial
-from dpl.fem.materials.parameters import Composed
-from dpl.fem.materials.tensors import (
-    dyad,
-    green_lagrange,
-    symmetric_product,
-    trace,
-    with_axes,
-)
+from dpl.fem.materials.tensors import dyad, green_lagrange, symmetric_product, trace, with_axes
 
 
 class Hookean(InvariantBasedMaterial):
@@ -24,7 +17,6 @@ class Hookean(InvariantBasedMaterial):
 
     @property
     def constants(self) -> tuple[Tensor, ...]:
-        """Return lambda and mu."""
         return self.lam, self.mu
 
     @staticmethod
@@ -94,12 +86,10 @@ class LameElastic(SmallStrains):
 
     @property
     def mu(self) -> Tensor:
-        """Shear modulus over Young's modulus [-]."""
         return self.value("shear")
 
     @property
     def lam(self) -> Tensor:
-        """First Lame parameter over Young's modulus [-]."""
         return self.value("first")
 
 
@@ -107,13 +97,10 @@ class LameElastic(SmallStrains):
 def linear_law(law: Any, moduli: Tensor) -> Any:
     """Return the law of small strains with moduli in the order of `rest_moduli`, (M,).
 
-    A part of a law with moduli of its own registers a function.
+    A kind of parts with other moduli than mu and lambda registers a function.
     """
-    return LameElastic(*moduli.view(2, -1, 1))
-
-
-@linear_law.register
-def _of_parts(law: Composed, moduli: Tensor) -> Composed:
+    if not law.parts:
+        return LameElastic(*moduli.view(2, -1, 1))
     counts = [part.rest_moduli.shape[1] for part in law.parts.values()]
     parts = zip(law.parts.items(), moduli.split(counts), strict=True)
     return law.with_parts({name: linear_law(part, own) for (name, part), own in parts})

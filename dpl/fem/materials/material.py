@@ -77,11 +77,7 @@ class Material(Parametrised):
         raise NotImplementedError(f"{type(self).__name__} has no energy")
 
     def response(self, E: Tensor) -> Response:
-        """Return stress and moduli at Green-Lagrange strains E, (..., 3, 3) [-].
-
-        Raises:
-            NotImplementedError: The law is its energy alone, see `has_response`.
-        """
+        """Return stress and moduli at Green-Lagrange strains E, (..., 3, 3) [-], if it has them."""
         raise NotImplementedError(f"{type(self).__name__} has no stress as a function of strain")
 
     @property
@@ -146,9 +142,9 @@ class Material(Parametrised):
         """Return the law in words: its class, numbers and ranges."""
         if not is_dataclass(self):
             return type(self).__name__
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
         words = []
-        for name, value in values.items():
+        for name in (each.name for each in fields(self)):
+            value = getattr(self, name)
             if isinstance(value, Tensor):
                 words.append(f"{name} from {value.min():.4g} to {value.max():.4g}")
             elif value is not None and (name, value) != ("young", 1) and name != "unit":
@@ -158,12 +154,17 @@ class Material(Parametrised):
     @property
     def mu(self) -> Tensor:
         """Shear modulus at rest over Young's modulus [-], of the shape of `Parametrised.value`."""
-        return self._at_rest[..., 0, 1, 0, 1]
+        return self._tangent_at_rest[..., 0, 1, 0, 1]
 
     @property
     def lam(self) -> Tensor:
         """First Lame parameter at rest over Young's modulus [-]."""
-        return self._at_rest[..., 0, 0, 1, 1]
+        return self._tangent_at_rest[..., 0, 0, 1, 1]
+
+    @property
+    def bulk_modulus(self) -> Tensor:
+        """Bulk modulus at rest over Young's modulus [-]."""
+        return self.lam + 2 / 3 * self.mu
 
     @property
     def poisson_ratio(self) -> Tensor:
@@ -171,7 +172,7 @@ class Material(Parametrised):
         return self.lam / (2 * (self.lam + self.mu))
 
     @property
-    def _at_rest(self) -> Tensor:
+    def _tangent_at_rest(self) -> Tensor:
         rest = torch.zeros(3, 3, dtype=torch.float64)
         return self.tangent(rest.expand(*self.energy(rest).shape, 3, 3))
 
@@ -182,12 +183,9 @@ class Material(Parametrised):
         return with_axes(self.mu, 2) * (H + H.mT) + pressure[..., None, None] * eye
 
     @property
-    def rest_moduli(self) -> Tensor:
-        """Moduli at rest of all cells, a vector (1, M) or (B, M) [-], see `linear_law`.
-
-        They are mu and lambda, of a field those of each cell.
-        """
-        return vector_of(self.mu, self.lam)
+    def moduli_at_rest(self) -> tuple[Tensor, ...]:
+        """Shear modulus and first Lame parameter at rest over Young's modulus [-]."""
+        return self.mu, self.lam
 
     @property
     def largest_poisson_ratio(self) -> float:
@@ -205,13 +203,10 @@ class Material(Parametrised):
         """Young's modulus at rest, see `Scalable`; over E, or in the unit of the moduli.
 
         With fibres it is that of the average over all directions, see `FibreReinforced.mu`.
-
-        Raises:
-            ValueError: A modulus is a field, or there is no stiffness at rest.
         """
         middles = [[ends.middle for ends in self.parameter_ranges.values()]]
         law = self.with_parameters(torch.tensor(middles, dtype=torch.float64))
-        young = float(law._moduli_at_rest[0].mean())
+        young = float(law._technical_moduli[0].mean())
         if not 0 < young < math.inf:
             raise ValueError(f"Young's modulus at rest = {young} must be above 0")
         return young
@@ -221,19 +216,16 @@ class Material(Parametrised):
         return self
 
     @property
-    def _moduli_at_rest(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _technical_moduli(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """E, mu, K and nu at rest."""
         mu, lam = torch.broadcast_tensors(self.mu, self.lam)
-        return mu * (3 * lam + 2 * mu) / (lam + mu), mu, lam + 2 / 3 * mu, self.poisson_ratio
+        young = mu * (3 * lam + 2 * mu) / (lam + mu)
+        return young, mu, self.bulk_modulus, self.poisson_ratio
 
     def describe_rest(self, young: Sequence[float]) -> str:
-        """Return E, mu, K and nu at rest in words, or their least and largest values.
-
-        Args:
-            young: Least and largest Young's modulus of the scene [Pa].
-        """
+        """Return E, mu, K and nu at rest in words, for the ends of Young's modulus [Pa]."""
         words, unit = [], " Pa"
-        columns = zip(*(law._moduli_at_rest for law in self._at_ends), strict=True)
+        columns = zip(*(law._technical_moduli for law in self._at_ends), strict=True)
         for name, values in zip(("E", "mu", "K", "nu"), columns, strict=True):
             ends = min(float(v.min()) for v in values), max(float(v.max()) for v in values)
             if name == "nu":
@@ -267,44 +259,40 @@ class YoungPoissonMaterial(Material, Scalable):
     def identity(self) -> dict[str, Any]:
         """Return class name and parameters; `young` is left out if it is that of the scene."""
         is_scene = isinstance(self.young, int | float) and self.young * self.unit == 1
-        exclude = ["young", "unit"] if is_scene else []
-        return identity_of(self, exclude=exclude)
+        return identity_of(self, exclude=["young", "unit"] if is_scene else [])
 
     @property
     def mu(self) -> Tensor:
-        """Shear modulus over Young's modulus [-]."""
         return self.value("young") / (2.0 * (1.0 + self.value("poisson")))
 
     @property
     def lam(self) -> Tensor:
-        """First Lame parameter over Young's modulus [-]."""
         nu = self.value("poisson")
         return self.value("young") * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
-
-    @property
-    def bulk(self) -> Tensor:
-        """Bulk modulus over Young's modulus [-]."""
-        return self.lam + 2 / 3 * self.mu
 
 
 class BulkOrPoisson(Material, Scalable):
     """Law with the volumetric term bulk/2 (J - 1)^2 and a shear modulus at rest `mu`.
 
     In place of `bulk`, Poisson's ratio at rest may be given: K = 2 mu (1 + nu) / (3 (1 - 2 nu)).
+
+    Attributes:
+        shear_name: The shear modulus at rest in terms of the constants, for a message.
     """
 
-    shear_name: ClassVar[str]  # the shear modulus at rest in terms of the constants, in a message
+    shear_name: ClassVar[str]
     bulk: Constant | None
     poisson: Constant | None
 
     def check_constants(self) -> None:
         """Check that the body resists shear and compression at rest."""
         shear, bulk = float(self.mu), float(self.bulk_modulus)
-        if not 0 < shear < math.inf:
-            words = "it is the shear modulus at rest"
-            raise ValueError(f"{self.shear_name} = {shear:g} must be above 0: {words}")
-        if not 0 < bulk < math.inf:
-            raise ValueError(f"bulk = {bulk:g} must be above 0")
+        for name, value, why in (
+            (self.shear_name, shear, ": it is the shear modulus at rest"),
+            ("bulk", bulk, ""),
+        ):
+            if not 0 < value < math.inf:
+                raise ValueError(f"{name} = {value:g} must be above 0{why}")
         constants = list(map(float, self.constants))
         if not all(map(math.isfinite, constants)):
             raise ValueError(f"moduli = {constants} must be finite numbers")
@@ -317,7 +305,6 @@ class BulkOrPoisson(Material, Scalable):
 
     @property
     def bulk_modulus(self) -> Tensor:
-        """Bulk modulus over Young's modulus [-]."""
         if self.bulk is not None:
             return self.value("bulk")
         nu = self.value("poisson")
@@ -325,7 +312,6 @@ class BulkOrPoisson(Material, Scalable):
 
     @property
     def lam(self) -> Tensor:
-        """First Lame parameter at rest over Young's modulus [-]."""
         return self.bulk_modulus - 2 / 3 * self.mu
 
     def normalised(self) -> Self:
@@ -333,9 +319,3 @@ class BulkOrPoisson(Material, Scalable):
         if any(isinstance(getattr(self, name), CellField) for name in self.ranged):
             return self
         return self.over(self.young_at_rest)
-
-
-def vector_of(*moduli: Tensor) -> Tensor:
-    """Return moduli, each of all cells, as one vector (1, M) or (B, M)."""
-    columns = torch.broadcast_tensors(*moduli, torch.zeros(1, 1, 1))[:-1]
-    return torch.cat(columns, dim=1)[..., 0]

@@ -31,7 +31,6 @@ class NeoHookeanLn(YoungPoissonMaterial, InvariantBasedMaterial):
 
     @property
     def constants(self) -> tuple[Tensor, ...]:
-        """Return lambda and mu."""
         return self.lam, self.mu
 
     @staticmethod
@@ -51,9 +50,8 @@ class NeoHookeanIsoK2(YoungPoissonMaterial, PolynomialMaterial):
 
     @property
     def constants(self) -> tuple[Tensor, ...]:
-        """Return mu/2, 0, 0, 0 and kappa."""
         half = self.mu / 2
-        return half, 0 * half, 0 * half, 0 * half, self.bulk
+        return half, 0 * half, 0 * half, 0 * half, self.bulk_modulus
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ class NeoHookeanIsoK4(NeoHookeanIsoK2):
 
     def energy(self, H: Tensor) -> Tensor:
         i1, _, j = isochoric_invariants(H)
-        return self.mu / 2 * i1 + self.bulk / 4 * (j * (2 + j) - 2 * torch.log1p(j))
+        return self.mu / 2 * i1 + self.bulk_modulus / 4 * (j * (2 + j) - 2 * torch.log1p(j))
 
     @staticmethod
     def invariant_derivatives(

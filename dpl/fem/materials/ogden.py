@@ -47,12 +47,10 @@ class OgdenK2(BulkOrPoisson):
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """Return all mu_i and alpha_i."""
         return *self.shear, *self.exponents
 
     @property
     def mu(self) -> Tensor:
-        """Shear modulus at rest over Young's modulus [-]."""
         return torch.tensor(sum(self.shear) * self.unit, dtype=torch.float64)
 
     @property
@@ -104,11 +102,8 @@ class OgdenK2(BulkOrPoisson):
             mean = grown.mean(-1, keepdim=True)
             T = T + 2 * mu / a * (grown - mean)
             power, third = 1 + grown, (1 + mean) / 3
-            dT = dT + 2 * mu * (
-                power[..., :, None] * eye
-                - (power[..., :, None] + power[..., None, :]) / 3
-                + third[..., None]
-            )
+            off = (power[..., :, None] + power[..., None, :]) / 3 - third[..., None]
+            dT = dT + 2 * mu * (power[..., :, None] * eye - off)
         stretch = 1 + 2 * strain
         moduli = (dT - 2 * T[..., :, None] * eye) / (stretch[..., :, None] * stretch[..., None, :])
         return T / stretch, moduli

@@ -72,6 +72,9 @@ class Parametrised:
     `value` returns a constant as a tensor that broadcasts against the points (B, E, Q): of shape
     (), of a field (E, 1), and of a batch of which each member has its own (B, 1, 1).
 
+    A law may have `parts` with constants of their own. In names of parameters and in messages the
+    name of the part comes first: core.poisson.
+
     Attributes:
         ranged: Names of the constants that may be ranges [low, high] or fields.
         dimensional: Names of those that are moduli, in one unit, see `Scalable`.
@@ -83,14 +86,12 @@ class Parametrised:
     unit: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in self.ranged:
-            value = getattr(self, name)
+        for name, value in self._given.items():
             if is_range(value):
                 object.__setattr__(self, name, ParameterRange.of(name, value))
             elif isinstance(value, Tensor) and not value.ndim:  # a modulus of another law
                 object.__setattr__(self, name, value.item())
-        values = {name: getattr(self, name) for name in self.ranged}
-        unknown = any(isinstance(value, CellField) for value in values.values())
+        unknown = any(isinstance(value, CellField) for value in self._given.values())
         if unknown or torch.compiler.is_compiling():  # a traced graph has no values to check
             return
         tensors, ranges = self._tensors, self.parameter_ranges
@@ -132,6 +133,15 @@ class Parametrised:
         return torch.full((), value, dtype=torch.float64)
 
     @property
+    def parts(self) -> Mapping[str, Any]:
+        """Parts with constants of their own, by name."""
+        return {}
+
+    def with_parts(self, parts: Mapping[str, Any]) -> Self:
+        """Return the law with other parts of the same names."""
+        return replace(cast("Any", self), **parts)
+
+    @property
     def constants(self) -> tuple[Any, ...]:
         """Numbers and tensors that the functions of the law in compiled loops take."""
         return tuple(map(self.value, self.ranged))
@@ -142,20 +152,48 @@ class Parametrised:
 
         A law with ranges has no moduli: it answers nothing before `with_parameters`.
         """
-        values = {name: getattr(self, name) for name in self.ranged}
-        return {name: v for name, v in values.items() if isinstance(v, ParameterRange)}
+        return self._of_ranges(getattr)
 
     @property
     def units_of_ranges(self) -> dict[str, float | None]:
         """Unit of each range over E [-], by name; None for a number without unit."""
-        names = self.parameter_ranges
-        return {name: self.unit if name in self.dimensional else None for name in names}
+        return self._of_ranges(lambda law, name: law.unit if name in law.dimensional else None)
+
+    def _of_ranges(self, of: Callable[[Any, str], Any]) -> dict[str, Any]:
+        """Return a function of law and name for each range of the law and its parts."""
+        own = [name for name, value in self._given.items() if isinstance(value, ParameterRange)]
+        found = {name: of(self, name) for name in own}
+        for key, part in self.parts.items():
+            found |= {f"{key}.{name}": value for name, value in part._of_ranges(of).items()}
+        return found
+
+    @property
+    def _given(self) -> dict[str, Any]:
+        """Constants as they are given, by name."""
+        return {name: getattr(self, name) for name in self.ranged}
 
     @property
     def _tensors(self) -> dict[str, Tensor]:
         """Constants that are fields or those of a batch."""
-        values = {name: getattr(self, name) for name in self.ranged}
-        return {name: v for name, v in values.items() if isinstance(v, Tensor)}
+        return {name: v for name, v in self._given.items() if isinstance(v, Tensor)}
+
+    @property
+    def moduli_at_rest(self) -> tuple[Tensor, ...]:
+        """Independent moduli of a law without parts at rest [-], see `linear_law`."""
+        raise NotImplementedError
+
+    @property
+    def rest_moduli(self) -> Tensor:
+        """Moduli at rest of all cells and parts, a vector (1, M) or (B, M) [-].
+
+        Moduli of a field are those of each cell.
+        """
+        if not self.parts:
+            columns = torch.broadcast_tensors(*self.moduli_at_rest, torch.zeros(1, 1, 1))[:-1]
+            return torch.cat(columns, dim=1)[..., 0]
+        parts = [part.rest_moduli for part in self.parts.values()]
+        batch = torch.broadcast_shapes(*(part.shape[:1] for part in parts))
+        return torch.cat([part.expand(*batch, -1) for part in parts], dim=1)
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
         """Return the law with the values of its fields in the cells of a body.
@@ -165,31 +203,43 @@ class Parametrised:
             length: Length unit of its mesh [m].
             origin: Origin of its mesh in that unit, (D,).
         """
-        made = {}
-        for name in self.ranged:
-            if isinstance(value := getattr(self, name), CellField):
+        parts, made = {}, {}
+        for key, part in self.parts.items():
+            with named_errors(f"{key}."):
+                parts[key] = part.on(basis, length, origin)
+        for name, value in self._given.items():
+            if isinstance(value, CellField):
                 with named_errors(f"{name}: "):
                     made[name] = value.on(basis, length, origin)
-        return replace(cast("Any", self), **made) if made else self
+        return self._changed(parts, made)
+
+    def _changed(
+        self, parts: Mapping[str, Any], constants: Mapping[str, Any] | None = None
+    ) -> Self:
+        """Return the law with other parts and constants; itself if none differs."""
+        same = all(part is self.parts[key] for key, part in parts.items())
+        law = self if same else self.with_parts(parts)
+        return replace(cast("Any", law), **constants) if constants else law
 
     def over(self, modulus: float) -> Self:
         """Return the law with its moduli divided by a modulus in their unit, see `Scalable`."""
-        raise ValueError(
-            f"the moduli of {type(self).__name__} are over Young's modulus; set young [Pa]"
-        )
+        if not self.parts:
+            raise ValueError(
+                f"the moduli of {type(self).__name__} are over Young's modulus; set young [Pa]"
+            )
+        return self.with_parts({key: part.over(modulus) for key, part in self.parts.items()})
 
     def of_cells(self, cells: Tensor) -> Self:
         """Return the law of some cells (C,) of the body."""
-        fields = {name: v for name, v in self._tensors.items() if v.shape[-2] > 1}
-        chosen = {name: v[..., cells, :] for name, v in fields.items()}
-        return replace(cast("Any", self), **chosen) if chosen else self
+        fields = {name: v[..., cells, :] for name, v in self._tensors.items() if v.shape[-2] > 1}
+        return self._changed({key: p.of_cells(cells) for key, p in self.parts.items()}, fields)
 
     def centred(self) -> Self:
         """Return the law without differences between the points of a cell, for one point of each.
 
         Only fibre frames may differ between points.
         """
-        return self
+        return self._changed({key: part.centred() for key, part in self.parts.items()})
 
     def with_parameters(self, parameters: Tensor) -> Self:
         """Return the law with values in place of its ranges.
@@ -202,17 +252,22 @@ class Parametrised:
         Raises:
             ValueError: The law has another number of ranges, or does not allow a value.
         """
-        names = tuple(self.parameter_ranges)
+        names = list(self.parameter_ranges)
         if parameters.shape[-1] != len(names):
-            raise ValueError(f"parameters: {type(self).__name__} has ranges of {list(names)}")
+            raise ValueError(f"parameters: {type(self).__name__} has ranges of {names}")
         if not names:
             return self
-        values: Any = parameters.T[..., None, None]  # beside cells and points
+        own = [name for name in names if name in self.ranged]
+        counts = [len(part.parameter_ranges) for part in self.parts.values()]
+        first, *others = parameters.split([len(own), *counts], dim=-1)
+        values: Any = first.T[..., None, None]  # beside cells and points
         # a traced graph has no values, and `len` would fix the size of its batch
         compiling = torch.compiler.is_compiling()
         if not compiling and len(parameters) == 1 and not parameters.requires_grad:
-            values = parameters[0].tolist()
-        return replace(cast("Any", self), **dict(zip(names, values, strict=True)))
+            values = first[0].tolist()
+        pairs = zip(self.parts.items(), others, strict=True)
+        parts = {key: part.with_parameters(part_values) for (key, part), part_values in pairs}
+        return self._changed(parts, dict(zip(own, values, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -242,67 +297,3 @@ class Scalable(Parametrised):
     def over(self, modulus: float) -> Self:
         """Return the law with its moduli divided by a modulus in their unit."""
         return replace(self, unit=self.unit / modulus)
-
-
-class Composed(Parametrised):
-    """Law of several parts, whose parameters have the name of the part before their own."""
-
-    @property
-    def parts(self) -> Mapping[str, Any]:
-        """The parts, by name."""
-        raise NotImplementedError
-
-    def with_parts(self, parts: Mapping[str, Any]) -> Self:
-        """Return the law with other parts of the same names."""
-        raise NotImplementedError
-
-    @property
-    def parameter_ranges(self) -> dict[str, ParameterRange]:
-        """Ranges of the parts, by name, see `Parametrised.parameter_ranges`."""
-        pairs = [(key, part.parameter_ranges.items()) for key, part in self.parts.items()]
-        return {f"{key}.{name}": ends for key, ranges in pairs for name, ends in ranges}
-
-    @property
-    def units_of_ranges(self) -> dict[str, float | None]:
-        """Units of the ranges of the parts, see `Parametrised.units_of_ranges`."""
-        pairs = [(key, part.units_of_ranges.items()) for key, part in self.parts.items()]
-        return {f"{key}.{name}": unit for key, units in pairs for name, unit in units}
-
-    @property
-    def rest_moduli(self) -> Tensor:
-        """Moduli at rest of the parts, one after the other, (1, M) or (B, M) [-]."""
-        parts = [part.rest_moduli for part in self.parts.values()]
-        batch = torch.broadcast_shapes(*(part.shape[:1] for part in parts))
-        return torch.cat([part.expand(*batch, -1) for part in parts], dim=1)
-
-    def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
-        parts = {}
-        for key, part in self.parts.items():
-            with named_errors(f"{key}."):
-                parts[key] = part.on(basis, length, origin)
-        return self._changed(parts)
-
-    def over(self, modulus: float) -> Self:
-        return self.with_parts({key: part.over(modulus) for key, part in self.parts.items()})
-
-    def of_cells(self, cells: Tensor) -> Self:
-        """Return the law of some cells (C,) of the body."""
-        return self._changed({key: part.of_cells(cells) for key, part in self.parts.items()})
-
-    def centred(self) -> Self:
-        return self._changed({key: part.centred() for key, part in self.parts.items()})
-
-    def _changed(self, parts: Mapping[str, Parametrised]) -> Self:
-        same = all(part is self.parts[key] for key, part in parts.items())
-        return self if same else self.with_parts(parts)
-
-    def with_parameters(self, parameters: Tensor) -> Self:
-        """Return the law with values (B, P) in place of the ranges of its parts."""
-        counts = [len(part.parameter_ranges) for part in self.parts.values()]
-        if parameters.shape[-1] != sum(counts):
-            names = list(self.parameter_ranges)
-            raise ValueError(f"parameters: {type(self).__name__} has ranges of {names}")
-        if not sum(counts):
-            return self
-        pairs = zip(self.parts.items(), parameters.split(counts, dim=-1), strict=True)
-        return self.with_parts({key: part.with_parameters(own) for (key, part), own in pairs})

@@ -24,10 +24,7 @@ def k4_derivatives(bulk: Any, j: Any) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class VolumetricK2(InvariantBasedMaterial, Scalable):
-    """Volumetric energy bulk/2 (J - 1)^2.
-
-    It does not resist shear, so that it is no law of a body without the fibres of
-    `FibreReinforced`.
+    """Volumetric energy bulk/2 (J - 1)^2, which needs the fibres of `FibreReinforced`.
 
     Source: The volumetric term of Abaqus (D1 = 2/bulk).
 
@@ -45,12 +42,10 @@ class VolumetricK2(InvariantBasedMaterial, Scalable):
 
     @property
     def mu(self) -> Tensor:
-        """Shear modulus at rest [-]: zero."""
         return torch.zeros((), dtype=torch.float64)
 
     @property
     def lam(self) -> Tensor:
-        """First Lame parameter at rest over Young's modulus [-]."""
         return self.value("bulk")
 
     @staticmethod

@@ -4,7 +4,7 @@ Meshes are objects of scikit-fem with coordinates in metres.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import skfem
@@ -15,6 +15,10 @@ from dpl.system.memory import refuse_mesh
 
 SMALLEST, LARGEST = 1e-12, 1e12  # sides of a body [m]
 MAX_ASPECT = 1e6  # longest over shortest side
+CELLS = {  # by dimension
+    2: {"quad": skfem.MeshQuad, "triangle": skfem.MeshTri},
+    3: {"hexahedron": skfem.MeshHex, "tetra": skfem.MeshTet},
+}
 
 
 def box(size: Sequence[float], nodes: Sequence[int], cell: str = "hexahedron") -> skfem.Mesh:
@@ -28,8 +32,7 @@ def box(size: Sequence[float], nodes: Sequence[int], cell: str = "hexahedron") -
         nodes: Numbers of vertices along the sides, at least 2.
         cell: "hexahedron", or "tetra" for six Kuhn tetrahedra per hexahedron.
     """
-    kinds = {"hexahedron": skfem.MeshHex, "tetra": skfem.MeshTet}
-    return grid(kinds, size, nodes, cell)
+    return grid(3, size, nodes, cell)
 
 
 def rectangle(size: Sequence[float], nodes: Sequence[int], cell: str = "quad") -> skfem.Mesh:
@@ -40,8 +43,7 @@ def rectangle(size: Sequence[float], nodes: Sequence[int], cell: str = "quad") -
         nodes: Numbers of vertices along the sides, at least 2.
         cell: "quad", or "triangle" for two triangles per quadrilateral.
     """
-    kinds = {"quad": skfem.MeshQuad, "triangle": skfem.MeshTri}
-    return grid(kinds, size, nodes, cell)
+    return grid(2, size, nodes, cell)
 
 
 def finger(
@@ -62,7 +64,7 @@ def finger(
         raise ValueError(f"cells = {list(cells)} must be at least [3, 3, 4], the last one even")
     inside = math.prod((cells[0] - 3, cells[1] - 3, cells[2] // 2 - 2))  # nodes of the chamber
     nodes = [n + 1 for n in cells]
-    block = grid({"hexahedron": skfem.MeshHex}, size, nodes, "hexahedron", unused=inside)
+    block = grid(3, size, nodes, "hexahedron", unused=inside)
     cell = np.array(size, dtype=np.float64) / cells
     lower = cell * [1, 1, cells[2] // 2]
     upper = np.array(size) - cell
@@ -73,17 +75,11 @@ def finger(
 
 
 def grid(
-    kinds: Mapping[str, type[skfem.Mesh]],
-    size: Sequence[float],
-    nodes: Sequence[int],
-    cell: str,
-    *,
-    unused: int = 0,
+    dim: int, size: Sequence[float], nodes: Sequence[int], cell: str, *, unused: int = 0
 ) -> skfem.Mesh:
     """Return a mesh of a box with equal cells, of which the caller removes `unused` nodes."""
-    if cell not in kinds:
-        raise ValueError(f"cell = {cell!r} must be one of {', '.join(kinds)}")
-    dim = kinds[cell].elem().dim
+    if cell not in CELLS[dim]:
+        raise ValueError(f"cell = {cell!r} must be one of {', '.join(CELLS[dim])}")
     if len(size) != dim or not all(SMALLEST <= s <= LARGEST for s in size):
         span = f"between {SMALLEST:g} and {LARGEST:g}"
         raise ValueError(f"size = {list(size)} must be {dim} positive lengths {span} [m]")
@@ -93,7 +89,7 @@ def grid(
         raise ValueError(f"nodes = {list(nodes)} must be {dim} integers of at least 2")
     refuse_mesh(math.prod(map(int, nodes)) - unused, "mesh.nodes")
     sides = [np.linspace(0.0, s, int(n)) for s, n in zip(size, nodes, strict=True)]
-    mesh = kinds[cell].init_tensor(*sides)
+    mesh = CELLS[dim][cell].init_tensor(*sides)
     order = np.lexsort([mesh.p[axis] for axis in np.argsort(nodes, kind="stable")])
     return type(mesh)(np.ascontiguousarray(mesh.p[:, order]), np.argsort(order)[mesh.t])
 

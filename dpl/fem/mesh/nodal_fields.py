@@ -34,10 +34,6 @@ def read_nodal_fields(
         names: Names of the fields.
         points: Nodes of the body, (N, D) [m].
         scale: Unit of the points in the files [m].
-
-    Raises:
-        OSError: A file cannot be read.
-        ValueError: A file is damaged, or its fields or nodes are not those of the body.
     """
     path = Path(path)
     if not path.is_dir():
@@ -48,7 +44,8 @@ def read_nodal_fields(
     order, places, parts = np.arange(len(points)), None, []
     for file in files:
         try:
-            found, fields = _read_vtk(file, names)
+            read = _read_vtkhdf if file.suffix.lower() == ".vtkhdf" else _read_vtk
+            found, fields = read(file, names)
             if places is None or not np.array_equal(found, places):
                 order, places = _order(found, points, scale), found
             parts.append([_rows(field, points, order) for field in fields])
@@ -70,16 +67,12 @@ def _read_arrays(path: Path, names: Sequence[str], points: Array, scale: float) 
         row = (-1, -1) if moved else points.shape
         fields = [read_array(path, row, name) for name in names]
         places = read_array(path, (-1,), "points") if moved else None
-    if places is None:
-        return [_rows(field, points, np.arange(len(points))) for field in fields]
-    order = _order(places, points, scale)
+    order = np.arange(len(points)) if places is None else _order(places, points, scale)
     return [_rows(field, points, order) for field in fields]
 
 
 def _read_vtk(path: Path, names: Sequence[str]) -> tuple[Array, list[Array]]:
     """Return the points (M, 3) of a VTK file and its fields, (S, M, 3) each."""
-    if path.suffix.lower() == ".vtkhdf":
-        return _read_vtkhdf(path, names)
     try:
         mesh = meshio.read(path)
     except (SystemExit, Exception) as error:  # meshio ends the program on some damaged files

@@ -1,8 +1,7 @@
 """A propeller of structured hexahedra, conforming from the bore to the tips."""
 
-import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import skfem
@@ -21,8 +20,7 @@ def propeller(
     diameter: float = 1.0,
     blades: int = 5,
     *,
-    hub_diameter: float = 0.2,
-    bore_diameter: float = 0.1,
+    hub_diameter: Sequence[float] = (0.1, 0.2),
     hub_length: float = 0.18,
     pitch_angle: Sequence[float] = (60.0, 25.0),
     chord: Sequence[float] = (0.21, 0.1),
@@ -45,8 +43,7 @@ def propeller(
     Args:
         diameter: Diameter of the circle of the tips [m].
         blades: Number of blades, at least 2.
-        hub_diameter: Outer diameter of the hub [m].
-        bore_diameter: Diameter of the bore for the shaft [m].
+        hub_diameter: Diameters of the bore for the shaft and of the hub [m].
         hub_length: Length of the hub along the shaft [m].
         pitch_angle: Angles of the sections to the plane of rotation at root and tip [degrees]. The
             pitch 2 pi r tan(pitch angle) is linear along the blade.
@@ -55,10 +52,26 @@ def propeller(
         cells: Numbers of cells through a blade, on the hub between two blades, through the wall of
             the hub, along the chord (and the hub), and along the blade.
     """
-    lengths = {"bore_diameter": bore_diameter, "hub_diameter": hub_diameter, "diameter": diameter}
-    radii, pairs = [d / 2 for d in lengths.values()], {"chord": chord, "thickness": thickness}
-    _check_ranges({**lengths, "hub_length": hub_length}, pairs, blades, pitch_angle, cells)
-    blades = int(blades)
+    for key, length in (("diameter", diameter), ("hub_length", hub_length)):
+        if not 0 < length < math.inf:
+            raise ValueError(f"{key} = {length} must be a positive length [m]")
+    for key, pair, bound, kind in (
+        ("hub_diameter", hub_diameter, diameter, f"ascending lengths below {diameter} [m]"),
+        ("pitch_angle", pitch_angle, 90, "angles between 0 and 90 [degrees]"),
+        ("chord", chord, math.inf, "positive lengths [m]"),
+        ("thickness", thickness, math.inf, "positive lengths [m]"),
+    ):
+        if len(pair) != 2 or not all(0 < value < bound for value in pair):
+            raise ValueError(f"{key} = {list(pair)} must be 2 {kind}")
+    if hub_diameter[0] >= hub_diameter[1]:
+        raise ValueError(f"hub_diameter = {list(hub_diameter)} must ascend, bore before hub [m]")
+    if blades != int(blades) or blades < 2:
+        raise ValueError(f"blades = {blades} must be an integer of at least 2")
+    if len(cells) != 5 or not all(n == int(n) and n >= 1 for n in cells):
+        raise ValueError(f"cells = {list(cells)} must be 5 integers of at least 1")
+    blades, (t, g, w, c, s) = int(blades), map(int, cells)
+    refuse_mesh(blades * (c + 1) * ((t + g) * (w + 1) + (t + 1) * s), "mesh.cells")
+    radii = [d / 2 for d in (*hub_diameter, diameter)]
     blade = _blade(radii, hub_length, blades, pitch_angle, chord, thickness, cells)
     hub = _hub(radii, hub_length, blades, pitch_angle[0], thickness[0], cells)
     try:
@@ -69,33 +82,6 @@ def propeller(
     rings = np.arange(mesh.nelements) < blades * np.prod(np.array(hub.shape[1:]) - [0, 1, 1])
     parts = {"hub": np.flatnonzero(rings), "blades": np.flatnonzero(~rings)}
     return mesh.with_boundaries({"bore": bore}).with_subdomains(parts)
-
-
-def _check_ranges(
-    lengths: Mapping[str, float],
-    pairs: Mapping[str, Sequence[float]],
-    blades: int,
-    pitch_angle: Sequence[float],
-    cells: Sequence[int],
-) -> None:
-    for key, value in lengths.items():
-        if not 0 < value < math.inf:
-            raise ValueError(f"{key} = {value} must be a positive length [m]")
-    for (inner, small), (outer, large) in itertools.pairwise(list(lengths.items())[:3]):
-        if small >= large:
-            raise ValueError(f"{inner} = {small} must be less than {outer} = {large} [m]")
-    for key, pair, bound, kind in (
-        *((key, pair, math.inf, "positive lengths [m]") for key, pair in pairs.items()),
-        ("pitch_angle", pitch_angle, 90, "angles between 0 and 90 [degrees]"),
-    ):
-        if len(pair) != 2 or not all(0 < value < bound for value in pair):
-            raise ValueError(f"{key} = {list(pair)} must be 2 {kind}")
-    if blades != int(blades) or blades < 2:
-        raise ValueError(f"blades = {blades} must be a integer of at least 2")
-    if len(cells) != 5 or not all(n == int(n) and n >= 1 for n in cells):
-        raise ValueError(f"cells = {list(cells)} must be 5 integers of at least 1")
-    t, g, w, c, s = map(int, cells)
-    refuse_mesh(int(blades) * (c + 1) * ((t + g) * (w + 1) + (t + 1) * s), "mesh.cells")
 
 
 def _hub(

@@ -14,7 +14,8 @@ from skfem.refdom import Refdom, RefHex
 
 from dpl.fem.mesh.sandbox import read
 from dpl.fem.mesh.tags import add_tags
-from dpl.fem.mesh.validation import LARGEST, check_mesh, listed
+from dpl.fem.mesh.validation import check_coordinates, check_mesh, listed
+from dpl.system.checks import named_errors
 from dpl.system.memory import refuse_mesh
 
 CELLS = {  # supported types of cells in meshio: dimension, nodes
@@ -66,10 +67,8 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> skfem.Mesh:
     if not 0 < scale < math.inf:
         raise ValueError(f"scale = {scale} must be a number above 0, the unit of the file [m]")
     raw = read(path)
-    try:
+    with named_errors(f"{path}: "):
         mesh, repairs = to_mesh(raw)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
     if repairs:
         warnings.warn(f"{path}: {'; '.join(repairs)}", stacklevel=2)
     return mesh if scale == 1 else mesh.scaled(scale)
@@ -88,13 +87,10 @@ def read_cell_data(path: str | Path, names: Sequence[str]) -> list[Array]:
         FileNotFoundError: There is no such file.
         ValueError: The file cannot be read, or has no such field with a row for each cell.
     """
-    path = Path(path)
-    raw = read(path)
-    try:
+    raw = read(Path(path))
+    with named_errors(f"{path}: "):
         kind = _cell_type(raw)
         return [_cell_field(raw, kind, name) for name in names]
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
 def _cell_field(raw: meshio.Mesh, kind: str, name: str) -> Array:
@@ -102,16 +98,15 @@ def _cell_field(raw: meshio.Mesh, kind: str, name: str) -> Array:
     if name not in raw.cell_data:
         known = ", ".join(map(repr, sorted(raw.cell_data)[:20])) or "none"
         raise ValueError(f"has no cell data {name!r}; there are: {known}")
-    pairs = [
-        (block.data, np.asarray(values, dtype=np.float64))
+    parts = [
+        np.asarray(values, dtype=np.float64)
         for block, values in zip(raw.cells, raw.cell_data[name], strict=False)
         if block.type == kind
     ]
     cells = sum(len(block.data) for block in raw.cells if block.type == kind)
-    widths = {values.shape[1:] for _, values in pairs}
-    if len(widths) != 1 or sum(len(values) for _, values in pairs) != cells:
+    if len({part.shape[1:] for part in parts}) != 1 or sum(map(len, parts)) != cells:
         raise ValueError(f"cell data {name!r} must have one row for each of {cells} cells")
-    return np.concatenate([values for _, values in pairs])
+    return np.concatenate(parts)
 
 
 def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
@@ -130,12 +125,22 @@ def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
     _check_range(cells, len(points))
     used, compact = np.unique(cells, return_inverse=True)
     refuse_mesh(len(used), "its size")
-    compact = compact.reshape(-1, width)
-    points = _planar(points, used) if dim == 2 else points[used]
+    compact, unused = compact.reshape(-1, width), len(points) - len(used)
+    points = points[used]
+    check_coordinates(points, used)
+    if dim == 2:
+        away = points[:, 2:] - points[0, 2:]
+        bad = np.flatnonzero((np.abs(away) > 1e-9 * np.ptp(points, axis=0).max()).any(axis=1))
+        if len(bad):
+            raise ValueError(
+                "is a surface mesh embedded in 3D; a 2D mesh must have constant z "
+                f"({len(bad)} nodes do not: {listed(used[bad])})"
+            )
+        points = points[:, :2]
     mesh = from_meshio(meshio.Mesh(points, [(kind, compact)]))
     corners = np.unique(cells[:, : len(mesh.t)])  # vertex k is node corners[k] of the file
     mesh = add_tags(check_mesh(mesh, numbers=corners), raw, kind, corners)
-    return mesh, _repairs(mesh.elem.refdom, points[compact], len(raw.points) - len(used))
+    return mesh, _repairs(mesh.elem.refdom, points[compact], unused)
 
 
 def _cell_type(raw: meshio.Mesh) -> str:
@@ -184,21 +189,3 @@ def _check_range(cells: Numbers, nodes: int) -> None:
             f"node numbers of cells = {low} to {high} must be between 0 and {nodes - 1}{guess} "
             f"({len(bad)} such cells: {listed(bad)})"
         )
-
-
-def _planar(points: NDArray[np.float64], used: Numbers) -> NDArray[np.float64]:
-    """Return the used points (N, 2) of a mesh in a plane of constant third coordinate."""
-    points = points[used]
-    if points.shape[1] == 3:
-        bad = np.flatnonzero(~(np.abs(points[:, 2]) <= LARGEST))
-        if len(bad):  # NaN would pass the comparison of distances
-            flaw = f"{len(bad)} nodes are not finite or above {LARGEST:.0e} m"
-            raise ValueError(f"coordinates of {flaw}: {listed(used[bad])}")
-        away = np.abs(points[:, 2] - points[0, 2])
-        bad = np.flatnonzero(away > 1e-9 * np.ptp(points, axis=0).max())
-        if len(bad):
-            raise ValueError(
-                "is a surface mesh embedded in 3D; a 2D mesh must have constant z "
-                f"({len(bad)} nodes do not: {listed(used[bad])})"
-            )
-    return points[:, :2]

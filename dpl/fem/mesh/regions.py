@@ -61,10 +61,8 @@ class Box:
             raise ValueError(f"lower = {lower} must not be above upper = {upper}")
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        slack = SLACK * np.ptp(points, axis=0).max()
-        lower, upper = (
-            vector(name, getattr(self, name), points.shape[1], "m") for name in ("lower", "upper")
-        )
+        slack, dim = SLACK * np.ptp(points, axis=0).max(), points.shape[1]
+        lower, upper = vector("lower", self.lower, dim, "m"), vector("upper", self.upper, dim, "m")
         return ((points >= lower - slack) & (points <= upper + slack)).all(axis=1)
 
 
@@ -73,8 +71,7 @@ class Sphere:
     """Region: the nodes in a ball, including its surface.
 
     Attributes:
-        centre: D coordinates [m].
-        radius: Radius [m].
+        centre, radius: D coordinates, and a length [m].
     """
 
     centre: Sequence[float]
@@ -128,11 +125,7 @@ class Tag:
             raise ValueError(f'name = {self.name!r} must be a string; write numbers in quotes, "7"')
 
     def facets(self, mesh: skfem.Mesh) -> NDArray[np.int_] | None:
-        """Return the facets of that name, including interior ones; None for a name of cells.
-
-        Raises:
-            ValueError: The mesh has no such name; the message lists its names.
-        """
+        """Return the facets of that name, including interior ones; None for a name of cells."""
         facets, cells = mesh.boundaries or {}, mesh.subdomains or {}
         if self.name in facets:
             return np.asarray(facets[self.name])
@@ -159,11 +152,6 @@ Points = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 Region = Points | Tag | str
 
 
-def _resolved(region: Region) -> Points | Tag:
-    """Return a region; a string is the name of a `Tag`."""
-    return Tag(region) if isinstance(region, str) else region
-
-
 def nodes_in(
     region: Region, basis: skfem.Basis, scale: float = 1.0, origin: Origin = 0.0
 ) -> NDArray[np.bool_]:
@@ -177,10 +165,9 @@ def nodes_in(
         origin: Origin of that mesh in its own unit, (D,).
 
     Raises:
-        ValueError: The region contains no node, the group does not exist, or the region does not
-            return a mask (N,).
+        ValueError: The region contains no node, or the group does not exist.
     """
-    region = _resolved(region)
+    region = Tag(region) if isinstance(region, str) else region
     if isinstance(region, Tag):
         inside = np.zeros(basis.N, dtype=bool)
         facets = region.facets(basis.mesh)
@@ -203,7 +190,7 @@ def facets_in(
     A region contains the facets whose vertices all lie inside. A group contains its facets, or
     those whose vertices all belong to its cells. For arguments and errors see `nodes_in`.
     """
-    region, boundary = _resolved(region), mesh.boundary_facets()
+    region, boundary = Tag(region) if isinstance(region, str) else region, mesh.boundary_facets()
     if not isinstance(region, Tag):
         inside = _inside(region, (mesh.p.T + origin) * scale)[mesh.facets[:, boundary]].all(axis=0)
     elif (tagged := region.facets(mesh)) is not None:
@@ -225,7 +212,7 @@ def cells_in(
     A region contains the cells whose centres, the means of the vertices, lie inside. A group
     contains its cells; one of facets is an error. For arguments and other errors see `nodes_in`.
     """
-    region = _resolved(region)
+    region = Tag(region) if isinstance(region, str) else region
     if isinstance(region, Tag):
         if region.name not in (mesh.subdomains or {}):
             region.facets(mesh)  # raises if the mesh has no such name

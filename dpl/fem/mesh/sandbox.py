@@ -31,10 +31,7 @@ def read(path: Path) -> meshio.Mesh:
     """Return the mesh of a file that is not trusted, as meshio reads it.
 
     Point data are those of integers; data that `dpl.fem.mesh.reading` does not use are left out.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is refused or cannot be read; the message is one line with its name.
+    An error is one line with the name of the file.
     """
     size = _size(path)
     seconds = math.ceil(SECONDS[0] + SECONDS[1] * size)

@@ -17,11 +17,8 @@ Numbers = NDArray[np.int_]
 def add_tags(mesh: skfem.Mesh, raw: meshio.Mesh, kind: str, corners: Numbers) -> skfem.Mesh:
     """Return the mesh with the named sets of its file.
 
-    Args:
-        mesh: The mesh, its cells those of type `kind` in the order of the file.
-        raw: The content of the file.
-        kind: Type of the cells in meshio.
-        corners: Node of the file for each vertex of the mesh, (N,).
+    Its cells are those of type `kind` of the content `raw`, in their order, and its vertices are
+    the nodes `corners` (N,) of the file.
     """
     vertex = np.full(len(raw.points), -1)
     vertex[corners] = np.arange(len(corners))
@@ -45,10 +42,13 @@ def add_tags(mesh: skfem.Mesh, raw: meshio.Mesh, kind: str, corners: Numbers) ->
         elif (side := known[b]) is not None:
             found = side[members]
             facets.setdefault(name, []).append(found[found >= 0])
-    for name, b, bits in _saved_facets(raw):
-        if (own := indices[b]) is not None:
-            local, which = np.nonzero(bits >> np.arange(len(mesh.t2f))[:, None] & 1)
-            facets.setdefault(name, []).append(mesh.t2f[local, own[which]])
+    for field, blocks in raw.cell_data.items():  # of scikit-fem: a bit per facet of each cell
+        for b, bits in enumerate(blocks if field.startswith("skfem:b:") else ()):
+            if (own := indices[b]) is not None:
+                bits = np.asarray(bits).astype(np.int64) >> np.arange(len(mesh.t2f))[:, None] & 1
+                local, which = np.nonzero(bits)
+                name = field.removeprefix("skfem:b:")
+                facets.setdefault(name, []).append(mesh.t2f[local, own[which]])
     for name, inside in _node_sets(raw):
         full = inside[corners][mesh.facets].all(axis=0)
         facets.setdefault(name, []).append(np.flatnonzero(full))
@@ -70,11 +70,10 @@ def _find_facets(mesh: skfem.Mesh, sides: Numbers) -> Numbers:
 def _cell_sets(raw: meshio.Mesh) -> Iterator[tuple[str, int, Numbers]]:
     """Yield name, block and indices in the block of each named set of cells."""
     for name, blocks in raw.cell_sets.items():
-        if name and not name.startswith("gmsh:"):
-            for b, members in enumerate(blocks):
-                if np.size(members):
-                    yield name, b, np.asarray(members, dtype=np.int64)
-    groups = {tuple(key): name for name, key in raw.field_data.items() if np.size(key) == 2}
+        for b, members in enumerate(blocks):
+            if np.size(members):
+                yield name, b, np.asarray(members, dtype=np.int64)
+    groups = {tuple(key): name for name, key in raw.field_data.items()}
     for field, blocks in raw.cell_data.items():
         saved = field.startswith("skfem:")
         for b, number, members in () if saved else _values(blocks):
@@ -82,17 +81,9 @@ def _cell_sets(raw: meshio.Mesh) -> Iterator[tuple[str, int, Numbers]]:
                 yield f"{field}={number}", b, members
             elif number:  # 0: no group
                 yield groups.get((number, raw.cells[b].dim), str(number)), b, members
-        if field.startswith("skfem:s:") or (not saved and _is_mask(blocks)):
+        if field.startswith("skfem:s:") or (not saved and _distinct(blocks) == [0, 1]):
             for b, mask in enumerate(blocks):
                 yield field.removeprefix("skfem:s:"), b, np.flatnonzero(mask)
-
-
-def _saved_facets(raw: meshio.Mesh) -> Iterator[tuple[str, int, Numbers]]:
-    """Yield name, block and a bit per facet of each cell, as scikit-fem writes sets of facets."""
-    for field, blocks in raw.cell_data.items():
-        if field.startswith("skfem:b:"):
-            for b, bits in enumerate(blocks):
-                yield field.removeprefix("skfem:b:"), b, np.asarray(bits).astype(np.int64)
 
 
 def _node_sets(raw: meshio.Mesh) -> Iterator[tuple[str, NDArray[np.bool_]]]:
@@ -101,7 +92,7 @@ def _node_sets(raw: meshio.Mesh) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     sets = [(name, np.asarray(members)) for name, members in raw.point_sets.items()]
     for field, data in raw.point_data.items():
         sets += [(f"{field}={number}", members) for _, number, members in _values([data])]
-        sets += [(field, np.flatnonzero(data))] if _is_mask([data]) else []
+        sets += [(field, np.flatnonzero(data))] if _distinct([data]) == [0, 1] else []
     for name, members in sets:
         _check_indices(f"the set {name!r}", members, len(inside))
         inside[:] = False
@@ -120,21 +111,14 @@ def _check_indices(name: str, members: Numbers, count: int) -> None:
 
 def _values(blocks: list) -> Iterator[tuple[int, int, Numbers]]:
     """Yield block, value and indices for each value of a scalar integer field."""
-    if not _is_integer(blocks):
-        return
-    found = [np.unique(block, return_inverse=True) for block in blocks]
-    if len({int(v) for values, _ in found for v in values}) > MAX_VALUES:
-        return
-    for b, (values, which) in enumerate(found):
-        order = np.argsort(which, kind="stable")
-        ends = np.cumsum(np.bincount(which, minlength=len(values)))[:-1]
-        for value, members in zip(values, np.split(order, ends), strict=True):
-            yield b, int(value), members
+    if 0 < len(_distinct(blocks)) <= MAX_VALUES:
+        for b, block in enumerate(map(np.asarray, blocks)):
+            for value in np.unique(block):
+                yield b, int(value), np.flatnonzero(block == value)
 
 
-def _is_integer(blocks: list) -> bool:
-    return all(np.ndim(block) == 1 and np.asarray(block).dtype.kind in "iub" for block in blocks)
-
-
-def _is_mask(blocks: list) -> bool:
-    return _is_integer(blocks) and {int(v) for block in blocks for v in np.unique(block)} == {0, 1}
+def _distinct(blocks: list) -> list[int]:
+    """Return the values of a scalar integer field; none for another field."""
+    if not all(np.ndim(b) == 1 and np.asarray(b).dtype.kind in "iub" for b in blocks):
+        return []
+    return sorted({int(value) for block in blocks for value in np.unique(block)})

@@ -30,7 +30,10 @@ def check_mesh(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mes
             several disconnected pieces, parts that touch only in nodes or edges.
     """
     numbers = np.arange(mesh.p.shape[1]) if numbers is None else numbers
-    _check_nodes(mesh, numbers)
+    check_coordinates(mesh.p.T, numbers)
+    unused = np.setdiff1d(np.arange(mesh.nvertices), mesh.t)
+    if len(unused):
+        raise ValueError(f"{len(unused)} nodes belong to no cell: {_nodes(unused, numbers)}")
     _check_lists(mesh)
     orientation = _check_volumes(mesh)
     _check_sides(mesh, orientation)
@@ -40,21 +43,20 @@ def check_mesh(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mes
     return mesh
 
 
-def listed(numbers: Numbers, most: int = 5) -> str:
+def listed(numbers: Numbers | list[str], most: int = 5) -> str:
     """Return a text with the first numbers."""
     return ", ".join(map(str, numbers[:most])) + (", ..." if len(numbers) > most else "")
 
 
-def _check_nodes(mesh: skfem.Mesh, numbers: Numbers) -> None:
-    finite, used = np.isfinite(mesh.p).all(axis=0), np.bincount(mesh.t.ravel())
-    for subject, bad, flaw in (
-        ("coordinates of ", ~finite, "are not finite"),
-        ("coordinates of ", (np.abs(mesh.p) > LARGEST).any(axis=0), f"are above {LARGEST:.0e} m"),
-        ("", np.pad(used, (0, mesh.nvertices - len(used))) == 0, "belong to no cell"),
+def check_coordinates(points: NDArray[np.float64], numbers: Numbers) -> None:
+    """Raise a ValueError unless coordinates (N, D) are finite and at most `LARGEST`."""
+    for bad, flaw in (
+        (~np.isfinite(points).all(axis=1), "not finite"),
+        ((np.abs(points) > LARGEST).any(axis=1), f"above {LARGEST:.0e} m"),
     ):
         if bad.any():
             where = _nodes(np.flatnonzero(bad), numbers)
-            raise ValueError(f"{subject}{bad.sum()} nodes {flaw}: {where}")
+            raise ValueError(f"coordinates of {bad.sum()} nodes are {flaw}: {where}")
 
 
 def _check_lists(mesh: skfem.Mesh) -> None:
@@ -162,7 +164,10 @@ def _check_contacts(mesh: skfem.Mesh, numbers: Numbers) -> None:
     different diagonals overlap without hanging nodes; they share two vertices.
     """
     facets = mesh.boundary_facets()
-    around = _around(mesh, facets)  # (corners, F)
+    owners = mesh.f2t[0, facets]
+    local = (mesh.t2f[:, owners] == facets).argmax(axis=0)
+    # vertices of boundary facets in cyclic order, (corners, F)
+    around = mesh.t[np.array(mesh.elem.refdom.facets).T[:, local], owners]
     sides = mesh.p[:, around]  # (D, corners, F)
     vertices = np.unique(around)
     hanging = np.unique(vertices[_contacts(sides, mesh.p[:, vertices], -1e-6)[1]])
@@ -181,13 +186,6 @@ def _check_contacts(mesh: skfem.Mesh, numbers: Numbers) -> None:
                 "sides of cells overlap without being the same, their vertices differ: "
                 + _pairs(np.unique(np.sort(cells, axis=0), axis=1))
             )
-
-
-def _around(mesh: skfem.Mesh, facets: Numbers) -> Numbers:
-    """Return the vertices of boundary facets in cyclic order, (corners, F)."""
-    cells = mesh.f2t[0, facets]
-    local = (mesh.t2f[:, cells] == facets).argmax(axis=0)
-    return mesh.t[np.array(mesh.elem.refdom.facets).T[:, local], cells]
 
 
 def _contacts(
@@ -259,7 +257,6 @@ def _nodes(vertices: Numbers, numbers: Numbers) -> str:
     return listed(numbers[vertices[vertices < len(numbers)]])
 
 
-def _pairs(pairs: NDArray[np.int_], most: int = 4) -> str:
+def _pairs(pairs: Numbers) -> str:
     """Return a text with the first pairs of (2, n)."""
-    named = ", ".join(f"{a} and {b}" for a, b in pairs.T[:most])
-    return named + (", ..." if pairs.shape[1] > most else "")
+    return listed([f"{a} and {b}" for a, b in pairs.T[:5]], 4)

@@ -24,20 +24,9 @@ Array = NDArray[np.float64]
 def flat_cells(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
     """Return the type of the cells in meshio and their nodes in VTK order, (E, A), right-handed.
 
-    Args:
-        mesh: The body.
-        nodes: Number of nodes of its fields: that of the mesh, or of quadratic cells on it.
-
-    Raises:
-        ValueError: `nodes` is neither.
+    They are quadratic cells if `nodes` is the number of their nodes, not of those of the mesh.
     """
-    if nodes != mesh.p.shape[1]:
-        mesh = _quadratic(mesh)
-    if nodes != mesh.p.shape[1]:
-        raise ValueError(
-            f"fields = arrays of {nodes} nodes must have those of the mesh ({mesh.p.shape[1]})"
-        )
-    (block,) = to_meshio(mesh, encode_cell_data=False).cells
+    (block,) = to_meshio(_with_nodes(mesh, nodes), encode_cell_data=False).cells
     left, cells = _left_handed(mesh), block.data.copy()
     if left.any():
         cells[left] = cells[left][:, MIRRORED[: cells.shape[1]]]
@@ -53,9 +42,8 @@ def _left_handed(mesh: skfem.Mesh) -> NDArray[np.bool_]:
 
 
 def _tags(mesh: skfem.Mesh) -> dict[str, list[Array]]:
-    """Return the groups of a body as cell data, facets numbered as by `flat_cells`.
+    """Return `group_names` of a body as cell data, facets numbered as by `flat_cells`.
 
-    Only `group_names` are written.
     A set of facets is stored as one bit per facet of each cell. An exchange of the first two
     corners of a tetrahedron exchanges its last two facets.
     """
@@ -71,10 +59,16 @@ def _tags(mesh: skfem.Mesh) -> dict[str, list[Array]]:
     return tags
 
 
-def _quadratic(mesh: skfem.Mesh) -> skfem.Mesh:
-    """Return a mesh with the nodes of quadratic cells, numbered as in `Problem`."""
+def _with_nodes(mesh: skfem.Mesh, nodes: int) -> skfem.Mesh:
+    """Return the mesh with a number of nodes, perhaps of quadratic cells as in `Problem`."""
     name = type(mesh).__name__
-    return getattr(skfem, f"{name[:-1]}2").from_mesh(mesh) if name.endswith("1") else mesh
+    if nodes != mesh.p.shape[1] and name.endswith("1"):
+        mesh = getattr(skfem, f"{name[:-1]}2").from_mesh(mesh)
+    if nodes != mesh.p.shape[1]:
+        raise ValueError(
+            f"fields = arrays of {nodes} nodes must have those of the mesh ({mesh.p.shape[1]})"
+        )
+    return mesh
 
 
 def _to_meshio(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
@@ -84,9 +78,9 @@ def _to_meshio(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
         counts = ", ".join(map(str, [nodes, *others]))
         raise ValueError(f"fields = arrays of {counts} nodes must be equally long")
     kind, cells = flat_cells(mesh, nodes)
-    whole = mesh if nodes == mesh.p.shape[1] else _quadratic(mesh)
+    points = _spatial(_with_nodes(mesh, nodes).p.T)
     data = {name: _spatial(field) for name, field in fields.items()}
-    return meshio.Mesh(_spatial(whole.p.T), [(kind, cells)], point_data=data, cell_data=_tags(mesh))
+    return meshio.Mesh(points, [(kind, cells)], point_data=data, cell_data=_tags(mesh))
 
 
 def _spatial(field: Array) -> Array:
@@ -105,33 +99,24 @@ def write_mesh(path: Path, mesh: skfem.Mesh, fields: Mapping[str, Array]) -> Non
         mesh: The body [m].
         fields: Arrays (N,), (N, D) or (N, 3, 3) by name. If N is the number of nodes of quadratic
             cells (`Problem.points` of degree 2), quadratic cells are written.
-
-    Raises:
-        ValueError: N does not fit the mesh, or the lengths differ.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     meshio.write(path, _to_meshio(mesh, fields))
 
 
 def write_mesh_exactly(path: Path, mesh: skfem.Mesh) -> None:
-    """Write a mesh and its tags as VTU, so that `read_mesh` returns the same bits.
+    """Write a mesh [m] and its tags as VTU, so that `read_mesh` returns the same bits.
 
-    Unlike `write_mesh` it does not reorder the nodes of cells.
-
-    Args:
-        path: File of any name.
-        mesh: The body [m].
+    Unlike `write_mesh` it does not reorder the nodes of cells, and the file may have any name.
     """
     exact = to_meshio(mesh)
     exact.points = _spatial(exact.points)
-    exact.cell_data = {_quoted(name): data for name, data in exact.cell_data.items()}
-    meshio.write(path, exact, file_format="vtu")
-
-
-def _quoted(name: str) -> str:
-    """Return a name escaped for an XML attribute in ASCII; meshio does not escape names."""
     marks = {mark: f"&#{ord(mark)};" for mark in '"\t\n\r'}
-    return escape(name, marks).encode("ascii", "xmlcharrefreplace").decode()
+    exact.cell_data = {  # meshio does not escape names
+        escape(name, marks).encode("ascii", "xmlcharrefreplace").decode(): data
+        for name, data in exact.cell_data.items()
+    }
+    meshio.write(path, exact, file_format="vtu")
 
 
 def write_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Array]]) -> list[Path]:
@@ -208,12 +193,7 @@ def _write_vtkhdf(path: Path, bodies: Sequence[meshio.Mesh]) -> Path:
 
 
 def write_collection(path: Path, files: Sequence[tuple[float, str]]) -> None:
-    """Write a PVD file, a collection of VTU files for ParaView.
-
-    Args:
-        path: The PVD file.
-        files: Time and name of each VTU file, relative to the folder of `path`.
-    """
+    """Write a PVD file for ParaView: times and names of VTU files, relative to its folder."""
     lines = [f'<DataSet timestep="{time:.6g}" file={quoteattr(name)}/>' for time, name in files]
     head = '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">'
     rows = ['<?xml version="1.0"?>', head, "<Collection>", *lines, "</Collection>", "</VTKFile>"]

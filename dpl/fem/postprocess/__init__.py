@@ -6,7 +6,7 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.fem.postprocess.energy import RestStiffness, potential_energy, tangent_product
-    from dpl.fem.postprocess.stress import at_nodes, cauchy, deformation_gradient, von_mises
+    from dpl.fem.postprocess.stress import cauchy, von_mises
     from dpl.fem.postprocess.surface import coarse, facet_edges, triangle_normals, triangles
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

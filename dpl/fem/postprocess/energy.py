@@ -35,13 +35,9 @@ class RestStiffness:
         return known if known is not None and known.problem is problem else cls(problem)
 
     def product(self, field: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """Return K(0) v, (B, N, D) [-]; zero at fixed degrees of freedom.
+        """Return K(0) v, (B, N, D) [-], of a field v; zero at fixed degrees of freedom.
 
-        K(0) of any parameters is a linear combination of a few matrices, see `StiffnessTerms`.
-
-        Args:
-            field: v, (B, N, D) [-].
-            parameters: Parameters of the loads, (B, P); P = 0 by default.
+        K(0) of parameters (B, P) is a linear combination of a few matrices, see `StiffnessTerms`.
         """
         problem = self.problem
         if parameters is None or not problem.material.parameter_ranges:
@@ -53,30 +49,25 @@ class RestStiffness:
                 image[:, free] = (self._on_device @ columns).T
             return image
         law = problem.material.with_parameters(problem.law_parameters(parameters))
-        factors = self._terms.factors(law).to(field)
-        parts = torch.stack([rest.product(field) for rest in self._rest_of_terms])
+        terms, bodies = self._terms
+        factors = terms.factors(law).to(field)
+        parts = torch.stack([rest.product(field) for rest in bodies])
         image = torch.einsum("bk,kbnd->bnd", factors.expand(len(field), -1), parts)
         if problem.springs is not None:
             image = image + torch.where(problem.free, problem.springs.force(field), 0.0)
         return image
 
     @cached_property
-    def _terms(self) -> StiffnessTerms:
-        return StiffnessTerms.of(self.problem)
-
-    @cached_property
-    def _rest_of_terms(self) -> "list[RestStiffness]":
-        return [RestStiffness(body) for body in self._terms.bodies]
+    def _terms(self) -> "tuple[StiffnessTerms, list[RestStiffness]]":
+        """Terms of K(0), and their bodies."""
+        terms = StiffnessTerms.of(self.problem)
+        return terms, [RestStiffness(body) for body in terms.bodies]
 
     def linear_strain_energy(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return f.K(0)^-1 f / 2, the strain energy of the linear solution, (B,) [-].
 
         The relative error is about 1e-3, because the value is used as a scale only. Results are
         cached by the hash of the force, since the forces of a data set recur every epoch.
-
-        Args:
-            force: f, (B, N, D) [-].
-            parameters: Parameters of the loads, (B, P); P = 0 by default.
         """
         problem, found = self._linear.problem, []
         parameters = force.new_zeros(1, 0) if parameters is None else parameters
@@ -97,16 +88,10 @@ class RestStiffness:
 
     def energy(self, parameters: Tensor) -> Tensor:
         """Return the strain energy at rest W(0), (1,) or (B,) [-]; it is not zero for every law."""
-        if not parameters.shape[-1]:
-            return self._energy
         body = self.problem.with_parameters(parameters)
         nothing = body.points.new_zeros(1, len(body.cells), 1, 3, 3)
         volumes = body.dV.sum(1).expand(len(body.cells))
         return (body.material.energy(nothing)[..., 0] * volumes).sum(1).expand(len(parameters))
-
-    @cached_property
-    def _energy(self) -> Tensor:
-        return self.problem.energy(self.problem.points.new_zeros(1, *self.problem.shape))
 
     @cached_property
     def _linear(self) -> LinearSolver:

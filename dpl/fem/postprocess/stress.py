@@ -25,16 +25,18 @@ class Fields(NamedTuple):
 def fields(problem: Problem, displacement: Tensor) -> Fields:
     """Return stress and volume ratio at the nodes under displacements (B, N, D) [-].
 
-    The components of the stress and det F are fitted by linear functions, see `at_nodes`. The von
-    Mises stress is that of the nodal stress, and therefore never negative. min det F of a solution
-    is taken over quadrature points and differs from the smallest value at a node.
+    A nodal value is that of a linear function, fitted to the values in the cells around the node
+    (Zienkiewicz, Zhu 1992), see `dpl.fem.assembly.recovery.Recovery.build`. It is exact for values
+    that are linear in the undeformed coordinates, and may lie outside the range of the values. The
+    von Mises stress is that of the nodal stress, and therefore never negative. min det F of a
+    solution is taken over quadrature points and differs from the smallest value at a node.
     """
-    F = deformation_gradient(problem, displacement)
-    stress = at_nodes(problem, cauchy(problem, displacement))
-    return Fields(stress, von_mises(stress), at_nodes(problem, torch.linalg.det(F)))
+    stress = problem.recovery(cauchy(problem, displacement))
+    volume_ratio = torch.linalg.det(_deformation_gradient(problem, displacement))
+    return Fields(stress, von_mises(stress), problem.recovery(volume_ratio))
 
 
-def deformation_gradient(problem: Problem, displacement: Tensor) -> Tensor:
+def _deformation_gradient(problem: Problem, displacement: Tensor) -> Tensor:
     """Return F = I + du/dX at the quadrature points, (B, E, Q, 3, 3) [-]."""
     H = problem.discretisation.gradient(displacement)
     return H + torch.eye(3, dtype=H.dtype, device=H.device)
@@ -45,7 +47,7 @@ def cauchy(problem: Problem, displacement: Tensor) -> Tensor:
 
     In 2D it is that of plane strain and includes the component out of the plane.
     """
-    F = deformation_gradient(problem, displacement)
+    F = _deformation_gradient(problem, displacement)
     stress = problem.stress(displacement) @ F.mT
     return stress / torch.linalg.det(F)[..., None, None]
 
@@ -53,15 +55,5 @@ def cauchy(problem: Problem, displacement: Tensor) -> Tensor:
 def von_mises(stress: Tensor) -> Tensor:
     """Return sqrt(3/2 s : s), shape (...), of stresses (..., 3, 3) with deviators s."""
     mean = stress.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
-    deviator = stress - mean[..., None, None] * torch.eye(3, dtype=stress.dtype).to(stress)
+    deviator = stress - mean[..., None, None] * torch.eye(3).to(stress)
     return (1.5 * deviator.square().sum(dim=(-2, -1))).sqrt()
-
-
-def at_nodes(problem: Problem, values: Tensor) -> Tensor:
-    """Return nodal values (B, N, ...) of values at quadrature points (B, E, Q, ...).
-
-    A nodal value is that of a linear function, fitted to the values in the cells around the node
-    (Zienkiewicz, Zhu 1992), see `dpl.fem.assembly.recovery.Recovery.build`. It is exact for values
-    that are linear in the undeformed coordinates, and may lie outside the range of the values.
-    """
-    return problem.recovery(values)

@@ -14,28 +14,17 @@ def surface(mesh: skfem.Mesh) -> NDArray[np.int_]:
 
     The vertices of a polygon are in counterclockwise order seen from outside, in 2D from above.
     """
-    points = mesh.p.T
+    points = np.pad(mesh.p.T, ((0, 0), (0, 3 - mesh.dim())))
     if mesh.dim() == 2:
-        polygons = mesh.t.T.copy()
-        (a, b), (c, d) = _sides(points, polygons)
-        backwards = a * d < b * c
+        polygons, outwards = mesh.t.T.copy(), np.array([0.0, 0.0, 1.0])
     else:
         facets = mesh.boundary_facets()
         polygons = mesh.facets[:, facets].T.copy()
         inside = points[mesh.t[:, mesh.f2t[0, facets]]].mean(axis=0)
         outwards = points[polygons].mean(axis=1) - inside
-        first, second = (side.T for side in _sides(points, polygons))
-        backwards = (np.cross(first, second) * outwards).sum(axis=1) < 0
+    backwards = (triangle_normals(points, polygons[:, :3]) * outwards).sum(axis=1) < 0
     polygons[backwards] = polygons[backwards][:, ::-1]
     return polygons
-
-
-def _sides(
-    points: NDArray[np.float64], polygons: NDArray[np.int_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the vectors from the first corner of polygons to the next two, (D, P) each."""
-    a, b, c = (points[polygons[:, k]] for k in range(3))
-    return (b - a).T, (c - a).T
 
 
 def facet_edges(
@@ -72,11 +61,6 @@ def coarse(points: NDArray[Any], polygons: NDArray[np.int_], most: int) -> NDArr
 
     Source: Rossignac, Borrel (1993), Multi-resolution 3D approximations for rendering complex
     scenes.
-
-    Args:
-        points: Vertices, (N, D).
-        polygons: Indices of points, (P, corners).
-        most: Maximum number of polygons, at least 1.
     """
     if len(polygons) <= most:
         return polygons

@@ -4,6 +4,7 @@ Frames have the columns fibre f, sheet s and normal n = f x s. Where a law depen
 sheet may be left out: it is z x f, or x where the fibre lies along z.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +72,7 @@ class FibreFunction(FibreDirections):
         points = (at.reshape(len(at), -1).T + origin) * length
         found = self.function(np.ascontiguousarray(points))
         fibre, sheet = found if isinstance(found, tuple) else (found, None)
-        return _frames_on(basis, fibre, sheet, points=at.shape[2])
+        return _frames_of_rows(basis, at.shape[1:], fibre, sheet)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +97,11 @@ class FibreData(FibreDirections):
                 )
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        if self.file is None:
-            return _frames_on(basis, self.fibre, self.sheet)
-        names = [name for name in (self.fibre, self.sheet) if isinstance(name, str)]
-        fibre, *sheet = read_cell_data(self.file, names)
-        return _frames_on(basis, fibre, sheet[0] if sheet else None)
+        given: list[Any] = [self.fibre, self.sheet]
+        if self.file is not None:
+            names = [name for name in given if isinstance(name, str)]
+            given[: len(names)] = read_cell_data(self.file, names)
+        return _frames_of_rows(basis, (basis.mesh.nelements,), *given)
 
 
 @dataclass(frozen=True)
@@ -136,93 +137,84 @@ class LaplaceFibres(FibreDirections):
         _unit_vectors("longitudinal", np.array([self.longitudinal]))
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        """Return the frames of the points, (E, Q, 3, 3) [-], see `FibreDirections.on`."""
         surfaces = [
-            facets_in(part, basis.mesh, length, origin) for part in (self.inner, self.outer)
+            basis.get_dofs(facets_in(part, basis.mesh, length, origin)).all()
+            for part in (self.inner, self.outer)
         ]
-        depth, gradient = _laplace(basis, *(basis.get_dofs(facets).all() for facets in surfaces))
-        points = len(gradient) // basis.mesh.nelements
-        transmural = _unit_vectors("gradient between inner and outer", gradient, points)
-        axis = _unit_vectors("longitudinal", np.array([self.longitudinal]))
-        around = np.cross(axis, transmural)
-        parallel = np.linalg.norm(around, axis=1) < PARALLEL
-        _refuse(parallel, "longitudinal must not be parallel to the transmural direction", points)
-        around = _unit_vectors("circumferential direction", around, points)
-        angle = (self.inner_angle + (self.outer_angle - self.inner_angle) * depth)[:, None]
+        depth, gradient = _laplace(basis, *surfaces)
+        transmural = _unit_vectors("gradient between inner and outer", gradient)
+        around = np.cross(_unit_vectors("longitudinal", np.array([self.longitudinal])), transmural)
+        parallel = np.linalg.norm(around, axis=-1) < PARALLEL
+        _refuse(parallel, "longitudinal must not be parallel to the transmural direction")
+        around = _unit_vectors("circumferential direction", around)
+        angle = (self.inner_angle + (self.outer_angle - self.inner_angle) * depth)[..., None]
         fibre = np.cos(angle) * around + np.sin(angle) * np.cross(transmural, around)
-        return frames_of(fibre, transmural, points=points).unflatten(0, (-1, points))
+        return frames_of(fibre, transmural)
 
 
-def frames_of(fibre: Array, sheet: Array | None = None, *, points: int = 1) -> Tensor:
-    """Return right-handed orthonormal frames, (E, 3, 3) [-], of directions of any length.
+def frames_of(fibre: Array, sheet: Array | None = None) -> Tensor:
+    """Return right-handed orthonormal frames of cells, (E, 3, 3), or points, (E, Q, 3, 3) [-].
 
     Args:
-        fibre: Directions f, (E, 3) or (E, 2).
+        fibre: Directions f of any length, (E, D) or (E, Q, D), D = 2 or 3.
         sheet: Directions s, whose part across f is taken; default: z x f, or x where f
             lies along z.
-        points: Rows of each cell, for the message of an error.
     """
-    f = _unit_vectors("fibre", fibre, points)
+    f = _unit_vectors("fibre", fibre)
     if sheet is None:
         across = np.cross([0.0, 0.0, 1.0], f)
-        along_z = np.linalg.norm(across, axis=1, keepdims=True) < PARALLEL
+        along_z = np.linalg.norm(across, axis=-1, keepdims=True) < PARALLEL
         sheet = np.where(along_z, [1.0, 0.0, 0.0], across)
-    s = _unit_vectors("sheet", sheet, points)
-    s = s - (s * f).sum(1, keepdims=True) * f
-    _refuse(np.linalg.norm(s, axis=1) < PARALLEL, "sheet must not be parallel to fibre", points)
-    s = s / np.linalg.norm(s, axis=1, keepdims=True)
-    s = s - (s * f).sum(1, keepdims=True) * f  # again, for directions that are nearly parallel
-    s = s / np.linalg.norm(s, axis=1, keepdims=True)
+    s = _unit_vectors("sheet", sheet)
+    s = s - (s * f).sum(-1, keepdims=True) * f
+    _refuse(np.linalg.norm(s, axis=-1) < PARALLEL, "sheet must not be parallel to fibre")
+    s = s / np.linalg.norm(s, axis=-1, keepdims=True)
+    s = s - (s * f).sum(-1, keepdims=True) * f  # again, for directions that are nearly parallel
+    s = s / np.linalg.norm(s, axis=-1, keepdims=True)
     return torch.from_numpy(np.stack([f, s, np.cross(f, s)], axis=-1))
 
 
-def _frames_on(basis: skfem.Basis, fibre: Any, sheet: Any = None, points: int = 0) -> Tensor:
-    """Return frames of directions for the cells of a body, (E, 3, 3), or for their points [-].
-
-    With `points` in each cell, rows of the directions are those of the points, and the result is
-    (E, Q, 3, 3).
-    """
-    cells, dim = basis.mesh.t.shape[1], basis.mesh.dim()
-    rows = cells * max(points, 1)
-    for name, given in (("fibre", fibre), ("sheet", sheet)):
-        shape = np.shape(given)
-        if given is not None and shape not in ((rows, dim), (rows, 3)):
-            each = "point" if points else "cell"
-            raise ValueError(f"{name} of shape {shape} must have ({rows}, {dim}), a row per {each}")
-    sheet = None if sheet is None else np.asarray(sheet, dtype=np.float64)
-    frames = frames_of(np.asarray(fibre, dtype=np.float64), sheet, points=max(points, 1))
-    return frames.unflatten(0, (cells, points)) if points else frames
+def _frames_of_rows(basis: skfem.Basis, shape: tuple[int, ...], *given: Any) -> Tensor:
+    """Return frames of given f and s (or None) in rows for cells (E,) or for points (E, Q)."""
+    rows, dim = math.prod(shape), basis.mesh.dim()
+    parts: list[Any] = []
+    for name, part in zip(("fibre", "sheet"), given, strict=True):
+        if part is not None and np.shape(part) not in ((rows, dim), (rows, 3)):
+            each = "point" if len(shape) > 1 else "cell"
+            raise ValueError(
+                f"{name} of shape {np.shape(part)} must have ({rows}, {dim}), a row per {each}"
+            )
+        parts.append(None if part is None else np.asarray(part).reshape(*shape, -1))
+    return frames_of(*parts)
 
 
-def _unit_vectors(name: str, vectors: Array, points: int = 1) -> Array:
-    """Return vectors (E, 2) or (E, 3) divided by their lengths, (E, 3) [-]."""
+def _unit_vectors(name: str, vectors: Array) -> Array:
+    """Return vectors (..., 2) or (..., 3) divided by their lengths, (..., 3) [-]."""
     vectors = np.asarray(vectors, dtype=np.float64)
-    if vectors.ndim != 2 or vectors.shape[1] not in (2, 3):
+    if vectors.shape[-1] not in (2, 3):
         raise ValueError(f"{name} = {vectors.tolist()} must have 2 or 3 components")
-    vectors = np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
-    largest = np.abs(vectors).max(axis=1, keepdims=True)
-    bad = ~((largest > 0) & np.isfinite(largest))[:, 0]
-    _refuse(bad, f"{name} must be finite and not zero", points)
+    if vectors.shape[-1] == 2:
+        vectors = np.concatenate([vectors, np.zeros_like(vectors[..., :1])], axis=-1)
+    largest = np.abs(vectors).max(axis=-1, keepdims=True)
+    bad = ~((largest > 0) & np.isfinite(largest))[..., 0]
+    _refuse(bad, f"{name} must be finite and not zero")
     vectors = vectors / largest  # squares of it neither overflow nor vanish
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _refuse(bad: NDArray[np.bool_], message: str, points: int = 1) -> None:
-    """Raise a ValueError with the numbers of the cells with `bad` (E Q,) at one of Q points."""
+def _refuse(bad: NDArray[np.bool_], message: str) -> None:
+    """Raise a ValueError with the numbers of the cells that are `bad` (E,) or (E, Q)."""
     if bad.any():
-        cells = np.unique(np.flatnonzero(bad) // points)
-        where = f" (cells {listed(cells)})" if len(bad) > 1 else ""
-        raise ValueError(message + where)
+        cells = np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))
+        raise ValueError(message + (f" (cells {listed(cells)})" if len(bad) > 1 else ""))
 
 
 def _laplace(
     basis: skfem.Basis, inner: NDArray[np.int_], outer: NDArray[np.int_]
 ) -> tuple[Array, Array]:
-    """Return the solution of Laplace's equation (E Q,) [-] and its gradient (E Q, D) at points.
+    """Return the solution of Laplace's equation (E, Q) [-] and its gradient (E, Q, D) at points.
 
-    Args:
-        basis: Scalar basis.
-        inner, outer: Degrees of freedom where the solution is 0 and 1.
+    It is 0 and 1 at the degrees of freedom `inner` and `outer` of the scalar basis.
     """
     if len(both := np.intersect1d(inner, outer)):
         raise ValueError(f"inner and outer must not touch; they share {len(both)} nodes")
@@ -230,5 +222,4 @@ def _laplace(
     values[outer] = 1.0
     system = skfem.condense(laplace.assemble(basis), x=values, D=np.concatenate([inner, outer]))
     field = basis.interpolate(skfem.solve(*system, solver=solver_iter_pcg(rtol=LAPLACE_TOL)))
-    slopes = field.grad.reshape(len(field.grad), -1)
-    return np.asarray(field).ravel(), np.ascontiguousarray(slopes.T)
+    return np.asarray(field), np.moveaxis(field.grad, 0, -1)

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from dpl.fem.materials.arithmetic import exp, positive_part, step
 from dpl.fem.materials.linear_elastic import linear_law
-from dpl.fem.materials.material import vector_of
 from dpl.fem.materials.parameters import Constant, Parametrised, Scalable
 from dpl.fem.options import option
 
@@ -36,11 +35,6 @@ class FibreEnergy(Parametrised):
     def energy(self, e: Tensor) -> Tensor:
         """Return the energy density over E, (...,) [-], of e = C - I (..., 3, 3) [-]."""
         raise NotImplementedError
-
-    @property
-    def rest_moduli(self) -> Tensor:
-        """The 21 moduli at rest of all cells, a vector (1, 21 M) or (B, 21 M) [-]."""
-        return vector_of(*self.moduli_at_rest)
 
     @property
     def moduli_at_rest(self) -> tuple[Tensor, ...]:
@@ -74,9 +68,7 @@ class Guccione(FibreEnergy, Scalable):
 
     Attributes:
         c: Modulus over E [-].
-        bf: Exponent along the fibre [-].
-        bt: Exponent across the fibre [-].
-        bfs: Exponent of shear between the two [-].
+        bf, bt, bfs: Exponents along the fibre, across it and of shear between the two [-].
     """
 
     ranged: ClassVar[tuple[str, ...]] = ("c", "bf", "bt", "bfs")
@@ -146,8 +138,8 @@ class HolzapfelGasserOgdenFibres(FibreEnergy, Scalable):
         k1, k2, m11, m22, m33, m12, n12 = self.constants
         e11, e22, e33, e12, _, _ = components(e)
         normal = m11 * e11 + m22 * e22 + m33 * e33
-        families = (normal + 2 * shear * e12 for shear in (m12, n12))
-        return sum((_exponential_energy(k1, k2, positive_part(x)) for x in families), 0 * e11)
+        families = (positive_part(normal + 2 * shear * e12) for shear in (m12, n12))
+        return sum((_exponential_energy(k1, k2, x) for x in families), 0 * e11)
 
     @property
     def constants(self) -> tuple[Tensor, ...]:
@@ -215,7 +207,7 @@ class HolzapfelOgdenFibres(FibreEnergy, Scalable):
     def strain_derivatives(c: Any, e: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         f1, f2 = tension_derivatives(c[0], c[1], e[0])
         s1, s2 = tension_derivatives(c[2], c[3], e[1])
-        g1, g2 = exponential_derivatives(c[4], c[5], e[3])
+        g1, g2 = exponential_derivatives(c[4], c[5], e[3], 1.0)
         S = (2 * f1, 2 * s1, 0.0, g1, 0.0, 0.0)
         D1 = (4 * f2, 0.0, 0.0, 0.0, 0.0, 0.0)
         D2 = (4 * s2, 0.0, 0.0, 0.0, 0.0)
@@ -241,7 +233,6 @@ class LinearFibres(FibreEnergy):
 
     @property
     def constants(self) -> tuple[Tensor, ...]:
-        """Return the moduli."""
         return tuple(self.moduli)
 
     @staticmethod
@@ -274,19 +265,16 @@ def components(e: Tensor) -> tuple[Tensor, ...]:
     return tuple(e[..., i, j] for i, j in COMPONENTS)
 
 
-def exponential_derivatives(a: Any, b: Any, x: Any) -> tuple[Any, Any]:
-    """Return the first two derivatives of a/(2 b) (exp(b x^2) - 1)."""
-    square = b * x * x
+def exponential_derivatives(a: Any, b: Any, y: Any, slope: Any) -> tuple[Any, Any]:
+    """Return the first two derivatives of a/(2 b) (exp(b y^2) - 1) by x, where y' is 0 or 1."""
+    square = b * y * y
     f = a * exp(square)
-    return f * x, f * (1 + 2 * square)
+    return f * y, f * (slope + 2 * square)
 
 
 def tension_derivatives(a: Any, b: Any, x: Any) -> tuple[Any, Any]:
     """Return the first two derivatives of a/(2 b) (exp(b <x>^2) - 1), <x> = max(x, 0)."""
-    y = positive_part(x)
-    square = b * y * y
-    f = a * exp(square)
-    return f * y, f * (step(x) + 2 * square)
+    return exponential_derivatives(a, b, positive_part(x), step(x))
 
 
 def _exponential_energy(a: Tensor, b: Tensor, x: Tensor) -> Tensor:

@@ -11,7 +11,6 @@ from torch import Tensor
 from dpl.fem.materials.fibres.energies import FibreEnergy, LinearFibres, as_tensors, components
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import CompiledForm, Material, Response
-from dpl.fem.materials.parameters import Composed
 from dpl.fem.materials.tensors import green_lagrange
 from dpl.fem.mesh.regions import Origin
 from dpl.system.checks import named_errors
@@ -43,7 +42,7 @@ class FibreDirections:
 
 
 @dataclass(frozen=True, eq=False)
-class FibreReinforced(Composed, Material):
+class FibreReinforced(Material):
     """Anisotropic law: the energy of an isotropic matrix plus that of fibres in a frame.
 
     W = matrix.energy(H) + fibres.energy(Q^T (C - I) Q), Q the fibre frame of the cell. The matrix
@@ -78,18 +77,13 @@ class FibreReinforced(Composed, Material):
 
     @property
     def finite(self) -> bool:  # type: ignore[override]
-        """False for a term of K(0) only."""
         return self.matrix.finite
 
     @property
     def parts(self) -> Mapping[str, Any]:
         return {"matrix": self.matrix, "fibres": self.fibres}
 
-    def with_parts(self, parts: Mapping[str, Any]) -> Self:
-        return replace(self, **parts)
-
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
-        """Return the law with the frames of a body; arguments as in `FibreDirections.on`."""
         directions, cells = self.directions, basis.mesh.t.shape[1]
         if not isinstance(directions, Tensor):
             with named_errors("directions: "):
@@ -98,9 +92,8 @@ class FibreReinforced(Composed, Material):
             raise ValueError(
                 f"directions has frames of {len(directions)} cells and must have those of {cells}"
             )
-        if directions is self.directions:
-            return super().on(basis, length, origin)
-        return replace(super().on(basis, length, origin), directions=directions)
+        law = super().on(basis, length, origin)
+        return law if directions is self.directions else replace(law, directions=directions)
 
     def of_cells(self, cells: Tensor) -> Self:
         law = super().of_cells(cells)
@@ -109,23 +102,19 @@ class FibreReinforced(Composed, Material):
         return replace(law, directions=self.frames[cells.to(self.frames.device)])
 
     def centred(self) -> Self:
-        """Return the law with one frame in each cell, the rotation next to the mean of its frames.
-
-        See `Parametrised.centred`.
-        """
+        """Return the law with the rotation next to the mean of the frames of each cell."""
+        law = super().centred()
         if self.frames.ndim == 3:
-            return super().centred()
+            return law
         U, _, V = torch.linalg.svd(self.frames.mean(1))
-        return replace(super().centred(), directions=U @ V)
+        return replace(law, directions=U @ V)
 
     @property
     def compiled_form(self) -> CompiledForm:
-        """Matrix, fibres and their frames."""
         return CompiledForm(self.matrix, self.fibres, self.frames_of_points)
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """Constants of matrix and fibres."""
         return *self.matrix.constants, *self.fibres.constants
 
     @property
@@ -152,7 +141,7 @@ class FibreReinforced(Composed, Material):
 
     @property
     def point_bulk(self) -> Tensor:
-        """Bulk modulus that stays at the points: twice the shear modulus at rest [-].
+        """Twice the shear modulus at rest [-].
 
         The energy of the fibres depends on the volume too. Without this modulus, fibres under
         tension can invert points of a cell without a change of its projected volume.
@@ -175,13 +164,13 @@ class FibreReinforced(Composed, Material):
 
     @property
     def mu(self) -> Tensor:
-        """Shear modulus at rest over Young's modulus, the average over all directions [-]."""
+        """Shear modulus at rest, the average over all directions [-]."""
         normal, mixed = self._fibre_traces
         return self.matrix.mu + (3 * mixed - normal) / 30
 
     @property
     def lam(self) -> Tensor:
-        """First Lame parameter at rest over Young's modulus, the average over directions [-].
+        """First Lame parameter at rest, the average over all directions [-].
 
         Source: Voigt (1889), Ann. Phys. 274: the average over all rotations of the moduli D has the
         D_iikk and D_ikik of D.
@@ -208,10 +197,7 @@ class FibreReinforced(Composed, Material):
         return self.frames if self.frames.ndim == 4 else self.frames[:, None]
 
     def _rotation(self, H: Tensor) -> Tensor:
-        """Return the frames of the points, (E, Q or 1, 3, 3), or (3, 3) if all are equal.
-
-        Device and type are those of H.
-        """
+        """Return the frames of the points as H, (E, Q or 1, 3, 3), or (3, 3) if all are equal."""
         frames = self.frames_of_points.to(H)
         return frames[0, 0] if frames.shape[:2] == (1, 1) else frames
 
@@ -227,12 +213,7 @@ class FibreReinforced(Composed, Material):
 
 
 def fibre_frames(material: Material, count: int) -> Tensor:
-    """Return the fibre frames of the law of each cell, (E, Q or 1, 3, 3) [-]; NaN without fibres.
-
-    Args:
-        material: The law, after `Material.on`.
-        count: E, the number of cells.
-    """
+    """Return the fibre frames of the law of E cells, (E, Q or 1, 3, 3) [-]; NaN without fibres."""
     laws = [
         (law.frames_of_points, cells)
         for law, cells in material.groups(count)
