@@ -123,18 +123,17 @@ def _checked_law(net: Any, scene: Scene) -> InvariantBasedMaterial:
 def _model(net: Unrolled) -> Arrays:
     """Return the arrays of `dpl.models.unrolled.loops`, of K(0)^-1 and of the estimated error."""
     (arrays, _), linear = net._arrays, net.linear
-    (characters, dofs, signs, scales), columns, *own = arrays
+    orbits, own = arrays.orbits, arrays._asdict()
+    del own["orbits"]
     law, inverse, _ = net._at(torch.zeros(1, 0))
     (table, unknowns, _), values = linear.blocks
     factors = np.append(linear.terms.factors(net.scene.problem.material)[0].numpy(), 1.0)
     return {
-        "characters": characters,
-        "dofs": dofs.astype(np.int32),
-        "signs": signs,
-        "scales": scales,
-        "supports": (factors @ linear._supports.numpy()).reshape(dofs.shape),
-        "columns": columns.astype(np.int32),
-        **dict(zip(arrays._fields[2:], own, strict=True)),
+        **orbits._asdict(),
+        "dofs": orbits.dofs.astype(np.int32),
+        "supports": (factors @ linear._supports.numpy()).reshape(orbits.dofs.shape),
+        **own,
+        "columns": arrays.columns.astype(np.int32),
         "reduced_inverse": inverse,
         "law_samples": law[1],
         "front_table": table,

@@ -4,6 +4,7 @@ import ctypes
 import shutil
 import subprocess
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -80,33 +81,34 @@ class Body:
         return displacement, surface, report
 
 
+CHECKS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DDPL_SCALAR"]
+PROGRAMS = {  # options and source: with SIMD, checked without it, and the example
+    "library": ["-O2", "-shared", "-fPIC", str(HOME / "dpl_c.cpp")],
+    "opened": ["-O0", *CHECKS, "opened.cpp"],
+    "loop": ["-O0", str(HOME / "loop.cpp")],
+}
+
+
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory):
-    """A library with SIMD, a checked program without it, and the example, compiled at once."""
+    """Function that returns the path of a program, which is compiled when it is first used."""
     folder = tmp_path_factory.mktemp("programs")
     (folder / "opened.cpp").write_text(OPENED)
-    common = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{HOME}"]
-    checks = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DDPL_SCALAR"]
-    commands = {
-        "library": ["-O2", "-shared", "-fPIC", str(HOME / "dpl_c.cpp")],
-        "opened": ["-O0", *checks, str(folder / "opened.cpp")],
-        "loop": ["-O0", str(HOME / "loop.cpp")],
-    }
-    started = {
-        name: subprocess.Popen(
-            [*common, *options, "-o", str(folder / name)], stderr=subprocess.PIPE, text=True
-        )
-        for name, options in commands.items()
-    }
-    for process in started.values():
-        message = process.communicate()[1]
-        assert process.returncode == 0, message
-    return folder
+
+    @cache
+    def programs(name):
+        command = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{HOME}"]
+        command += [*PROGRAMS[name], "-o", name]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
+        assert done.returncode == 0, done.stderr
+        return folder / name
+
+    return programs
 
 
 @pytest.fixture(scope="module")
 def library(programs):
-    found = ctypes.CDLL(str(programs / "library"))
+    found = ctypes.CDLL(str(programs("library")))
     pointer, text, number = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int
     for name, result, *arguments in (
         ("dpl_open", pointer, text),
@@ -168,10 +170,16 @@ def body(request, library, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def beam(library, tmp_path_factory):
+def written(tmp_path_factory):
     """The beam with an estimated error, and its file."""
     surrogate = surrogate_of(BODIES["equal hexahedra, eight symmetries"]())
-    path = write_runtime(tmp_path_factory.mktemp("beam"), surrogate)
+    return surrogate, write_runtime(tmp_path_factory.mktemp("beam"), surrogate)
+
+
+@pytest.fixture(scope="module")
+def beam(library, written):
+    """The beam, its body in C++, and its file."""
+    surrogate, path = written
     return surrogate, Body(library, path), path
 
 
@@ -300,7 +308,7 @@ def test_a_force_that_is_not_finite_is_an_error(beam, library):
 
 def opened(programs, *paths):
     """Return the lines of the checked program, one for each file."""
-    command = [str(programs / "opened"), *map(str, paths)]
+    command = [programs("opened"), *paths]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
@@ -319,8 +327,8 @@ def test_the_file_is_safetensors_and_read_without_simd_too(beam, programs):
         assert float(line) == pytest.approx(expected, rel=1e-9)
 
 
-def test_damaged_files_end_in_one_line(beam, programs, tmp_path):
-    content, random = beam[2].read_bytes(), np.random.default_rng(0)
+def test_damaged_files_end_in_one_line(written, programs, tmp_path):
+    content, random = written[1].read_bytes(), np.random.default_rng(0)
     header = 8 + int.from_bytes(content[:8], "little")
     damaged = [content[:size] for size in (0, 7, 8, 9, header - 1, header, len(content) - 1)]
     damaged += [content[:size] for size in random.integers(0, len(content), 8)]
@@ -369,8 +377,10 @@ def test_damaged_files_end_in_one_line(beam, programs, tmp_path):
         ("blocks", lambda a: a[:, :-1].copy()),
     ],
 )
-def test_words_and_arrays_that_do_not_fit_end_in_one_line(beam, programs, tmp_path, name, change):
-    arrays, words = load_file(beam[2]), WORDS
+def test_words_and_arrays_that_do_not_fit_end_in_one_line(
+    written, programs, tmp_path, name, change
+):
+    arrays, words = load_file(written[1]), WORDS
     if change is None:
         words = WORDS | name
     else:
@@ -380,14 +390,14 @@ def test_words_and_arrays_that_do_not_fit_end_in_one_line(beam, programs, tmp_pa
     assert line.startswith("error: " if change is None else "error: runtime file ")
 
 
-def test_the_example_prints_error_and_time_of_each_frame(beam, programs):
-    command = [str(programs / "loop"), str(beam[2]), "3", "0.5"]
+def test_the_example_prints_error_and_time_of_each_frame(written, programs):
+    command = [programs("loop"), written[1], "3", "0.5"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     head, names, *frames = done.stdout.splitlines()
     assert head == "45 nodes, 42 of the surface"
     assert [len(frame.split()) for frame in frames] == [len(names.split())] * 3
-    missing = subprocess.run([programs / "loop", "none"], capture_output=True, text=True)
+    missing = subprocess.run([programs("loop"), "none"], capture_output=True, text=True)
     assert (missing.returncode, missing.stderr) == (1, "error: none cannot be read\n")
 
 
