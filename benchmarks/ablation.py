@@ -142,9 +142,8 @@ def other_loads(net: Unrolled, row: Row, test: Sample, count: int) -> Iterator[R
 
 def errors(net: Unrolled, samples: Sample) -> dict[str, Any]:
     """Return the errors of a model, before and after one step in its modes, by name of `Row`."""
-    own = (samples.parameters,) if net.extra_inputs else ()
     with torch.inference_mode():
-        predicted = net(samples.force, *own)
+        predicted = net(samples.force, samples.parameters)
         solver = net.correction()
         corrected = predicted
         if solver is not None:
@@ -231,7 +230,7 @@ def _panels(net: Unrolled, test: Sample) -> list[tuple[str, Tensor | None, Tenso
     problem, k = net.scene.problem, int(test.displacement.flatten(1).norm(dim=1).argmax())
     load = test.load.unbatch()[k]
     with torch.inference_mode():
-        predicted = net(load.force, *((load.parameters,) if net.extra_inputs else ()))
+        predicted = net(load.force, load.parameters)
         linear = linear_solution(net, load)[0]
         unbalanced = problem.residual(predicted, load.force)[0].norm(dim=1)
         solver = net.correction()

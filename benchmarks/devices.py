@@ -29,7 +29,7 @@ from dpl.commands.cli import command
 from dpl.evaluation.timing import percentiles
 from dpl.fem import Load
 from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
-from dpl.models.inputs import Base
+from dpl.models.interface import Base
 from dpl.scene import Sample, Scene
 from dpl.system.threads import limited_threads
 from dpl.training import MSE, Surrogate

@@ -13,7 +13,7 @@ from benchmarks.grasps import random_grasps
 from dpl import evaluation
 from dpl.evaluation.tables import power
 from dpl.evaluation.timing import percentiles
-from dpl.export import ExportGraph, OnnxSession, export_onnx
+from dpl.export import OnnxSession, export_onnx
 from dpl.export.onnx_graph import missing_packages
 from dpl.fem import Load
 from dpl.inference import Simulator
@@ -63,7 +63,7 @@ def call_times(simulator: Simulator, load: Load, *, repeats: int = 1) -> Iterato
         yield from _frames(simulator)
     if not missing_packages():  # last, since the export takes longest
         with tempfile.TemporaryDirectory() as folder:
-            export_onnx(ExportGraph(simulator.surrogate), path := Path(folder) / "model.onnx")
+            export_onnx(simulator.surrogate, path := Path(folder) / "model.onnx")
             session = OnnxSession(path)
         arrays = [{name: column.numpy() for name, column in one.items()} for one in inputs]
         yield row("prediction, ONNX graph", lambda one: session(**one), arrays)

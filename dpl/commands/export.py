@@ -66,14 +66,14 @@ def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder
     from dpl.export.folder import MODEL
     from dpl.export.onnx_graph import PACKAGES
 
+    errors = _test_errors(Path(cfg.run))
     path, start = folder / MODEL, time.perf_counter()
     with config.error_in("run"):
-        graph = export.ExportGraph(surrogate)
-        export.export_onnx(graph, path)
+        export.export_onnx(surrogate, path)
     seconds = time.perf_counter() - start
-    export.write_folder(graph, folder, tol=cfg.tol, errors=_test_errors(Path(cfg.run)))
+    export.write_folder(surrogate, folder, tol=cfg.tol, errors=errors)
     loads = comparison.sample_check_loads(surrogate.scene, cfg.samples)
-    rows = comparison.compare_outputs(graph, export.OnnxSession(path), loads)
+    rows = comparison.compare_outputs(surrogate, export.OnnxSession(path), *loads)
     tables.show(rows, "ONNX against torch")
     largest = max(row.max_error for row in rows)
     size = sum(file.stat().st_size for file in folder.glob(f"{MODEL}*"))

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from dpl.export.comparison import CHECK_STREAM
-from dpl.export.onnx_graph import Array, ExportGraph
+from dpl.export.onnx_graph import Array
 from dpl.fem import HasModes, Problem, evaluate_solution, solve, surface
 from dpl.fem.mesh.writing import flat_cells
 from dpl.fem.postprocess import triangles
@@ -41,26 +41,26 @@ RANGE = (
 
 
 def write_folder(
-    graph: ExportGraph, folder: Path, *, tol: float, errors: Mapping[str, Any] | None
+    surrogate: TrainedSurrogate, folder: Path, *, tol: float, errors: Mapping[str, Any] | None
 ) -> None:
-    """Write all files except the report for a graph that lies in the folder.
+    """Write all files except the report for a surrogate whose graph lies in the folder.
 
     Args:
-        graph: The graph.
+        surrogate: The surrogate.
         folder: The folder, with model.onnx.
         tol: Largest relative difference of ONNX and torch [-].
         errors: Errors on the test set, see `dpl.training.metrics`, if the run was evaluated.
     """
-    scene, loads = graph.surrogate.scene, graph.surrogate.scene.loads
+    scene, loads = surrogate.scene, surrogate.scene.loads
     (folder / "reference").mkdir(parents=True, exist_ok=True)
-    fields, reference = _solve_reference(graph)
+    fields, reference = _solve_reference(surrogate)
     for name, field in fields.items():
         _write_raw(folder / "reference" / f"{name}.f64", field)
     if isinstance(loads, HasModes):
         _write_raw(folder / "modes.f64", loads.modal_forces.numpy())
-    weights = {"state_dict": graph.surrogate.state_dict(), **checkpoints.entries_of_scene(scene)}
+    weights = {"state_dict": surrogate.state_dict(), **checkpoints.entries_of_scene(scene)}
     checkpoints.write(weights, folder / "weights.safetensors")
-    meta = _describe(graph, folder / MODEL, tol) | {"errors": errors, "reference": reference}
+    meta = _describe(surrogate, folder / MODEL, tol) | {"errors": errors, "reference": reference}
     lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in meta.items())
     with atomic_write(folder / "meta.json") as file:
         file.write(("{\n" + ",\n".join(lines) + "\n}\n").encode())
@@ -72,86 +72,79 @@ def _write_raw(path: Path, field: Array) -> None:
         file.write(np.ascontiguousarray(field, dtype="<f8").tobytes())
 
 
-def _describe(graph: ExportGraph, path: Path, tol: float) -> dict[str, Any]:
+def _describe(surrogate: TrainedSurrogate, path: Path, tol: float) -> dict[str, Any]:
     """Return the contents of meta.json without errors and reference."""
-    module, scene = graph.surrogate, graph.surrogate.scene
+    scene, predictor = surrogate.scene, surrogate.predictor
     loads, problem = scene.loads, scene.problem
-    law_ranges = problem.material.parameter_ranges
-    count = sum(parameter.numel() for parameter in module.net.parameters())
+    unit = "N" if problem.shape[1] == 3 else "N/m"
+    law, ranges = problem.material.identity(), problem.material.parameter_ranges
+    count = sum(parameter.numel() for parameter in surrogate.net.parameters())
     return {
         "format": FORMAT,
         "dpl": __version__,
         "scene": scene.fingerprint,
-        "network": {"name": type(module.net).__name__, "parameters": count},
-        "model": {**_model(graph, path), "tolerance": tol},
-        "units": {"length": "m", "force": _force_unit(scene), "stress": "Pa", "young": "Pa"},
+        "network": {"name": type(surrogate.net).__name__, "parameters": count},
+        "model": {**_model(scene, path, unit), "tolerance": tol},
+        "units": {"length": "m", "force": unit, "stress": "Pa", "young": "Pa"},
         "dofs": {
             "count": problem.free.numel(),
             "order": "node-major: D * node + component; components x, y, z",
             "fixed": _indices(~problem.free),
             "loadable": _indices(loads.loadable_dofs),
         },
-        "scales": _scales(module),
-        "material": {**_law(scene), "young": loads.moduli, **law_ranges},
+        "scales": {
+            "length": scene.length,
+            "force_unit": scene.force_unit,
+            "force": float(predictor.force_scale),
+            "displacement": float(predictor.displacement_scale),
+            "meaning": predictor.meaning,
+        },
+        "material": {
+            "name": law.pop("name"),
+            "parameters_over_E": law,
+            "young": loads.moduli,
+            **ranges,
+        },
         "range": _range(scene),
         "mesh": _mesh(problem),
     }
 
 
-def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
+def _model(scene: Scene, path: Path, force_unit: str) -> dict[str, Any]:
     """Return file and operator set, and name, shape, type and unit of each input and output."""
     import onnx
 
     stored = onnx.load(str(path), load_external_data=False)
-    scene = graph.surrogate.scene
-    problem, young = scene.problem, scene.loads.moduli[1]
+    problem, loads, young = scene.problem, scene.loads, scene.loads.moduli[1]
     units = problem.material.units_of_ranges.items()
     pascals = {name for name, unit in units if unit and math.isclose(unit * young, 1)}
     pascals.update(problem.follower_loads.ranges)
-    loads, field = scene.loads, ["B", *scene.problem.shape]
+    field = ["B", *problem.shape]
     known: dict[str, dict[str, Any]] = {
-        "force": {"shape": field, "type": "float64", "unit": _force_unit(scene)},
+        "force": {"shape": field, "unit": force_unit},
         "young": {
             "shape": ["B"],
-            "type": "float64",
             "unit": "Pa",
             "range": loads.moduli,
             "distribution": "log" if loads.moduli.is_log else "uniform",
         },
         "parameters": {
             "shape": ["B", len(loads.parameter_ranges)],
-            "type": "float64",
             "unit": ["Pa" if name in pascals else "1" for name in loads.parameter_ranges],
             "ranges": loads.parameter_ranges,
         },
-        "displacement": {"shape": field, "type": "float64", "unit": "m"},
+        "displacement": {"shape": field, "unit": "m"},
     }
-    both = {"inputs": graph.inputs, "outputs": graph.outputs}
-    named = {key: [{"name": name, **known[name]} for name in names] for key, names in both.items()}
-    return {"file": path.name, "opset": int(stored.opset_import[0].version), **named}
-
-
-def _scales(module: TrainedSurrogate) -> dict[str, Any]:
-    return {
-        "length": module.scene.length,
-        "force_unit": module.scene.force_unit,
-        "force": float(module.predictor.force_scale),
-        "displacement": float(module.predictor.displacement_scale),
-        "meaning": module.predictor.meaning,
-    }
-
-
-def _force_unit(scene: Scene) -> str:
-    return "N" if scene.problem.shape[1] == 3 else "N/m"
+    inputs, outputs = (
+        [{"name": one.name, "type": "float64", **known[one.name]} for one in values]
+        for values in (stored.graph.input, stored.graph.output)
+    )
+    opset = int(stored.opset_import[0].version)
+    return {"file": path.name, "opset": opset, "inputs": inputs, "outputs": outputs}
 
 
 def _indices(mask: Tensor) -> list[int]:
     return mask.flatten().nonzero()[:, 0].tolist()
-
-
-def _law(scene: Scene) -> dict[str, Any]:
-    law = scene.problem.material.identity()
-    return {"name": law.pop("name"), "parameters_over_E": law}
 
 
 def _range(scene: Scene) -> dict[str, Any]:
@@ -171,7 +164,7 @@ def _range(scene: Scene) -> dict[str, Any]:
 def _mesh(problem: Problem) -> dict[str, Any]:
     kind, cells = flat_cells(problem.mesh, len(problem.points))
     return {
-        "points": (problem.length * (problem.points.numpy() + problem.origin)).tolist(),
+        "points": problem.points_in_metres.tolist(),
         "cell_type": kind,
         "cell_order": "VTK",
         "cells": cells.tolist(),
@@ -180,7 +173,7 @@ def _mesh(problem: Problem) -> dict[str, Any]:
 
 
 def _solve_reference(
-    graph: ExportGraph, *, max_loads: int = 16
+    surrogate: TrainedSurrogate, *, max_loads: int = 16
 ) -> tuple[dict[str, Array], dict[str, Any]]:
     """Return the first random load for which Newton converges, and its entry in meta.json.
 
@@ -191,12 +184,12 @@ def _solve_reference(
         and `fe_displacement`, (1, N, D) [m]. The entry has the shapes of the arrays, the relative
         residuals of both displacements, `fe_converged`, and their relative difference `error` [-].
     """
-    scene = graph.surrogate.scene
+    scene = surrogate.scene
     for k in range(max_loads):
         load = scene.loads.sample(CHECK_STREAM, [k])
         inputs = scene.si_inputs(load)
         with torch.inference_mode():
-            metres = graph(**inputs)
+            metres = surrogate(**inputs)
         fe = solve(scene.solver, load)
         if bool(fe.converged):
             break

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from dpl.training import TrainedSurrogate
 
@@ -28,63 +28,43 @@ def missing_packages() -> list[str]:
     return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
 
 
-class ExportGraph(nn.Module):
-    """TrainedSurrogate as a graph of tensor operations.
+def export_onnx(surrogate: TrainedSurrogate, path: Path) -> None:
+    """Write a surrogate as an ONNX file, and weights above 2 GB as `<path>.data`.
 
-    Attributes:
-        surrogate: The trained surrogate.
-        outputs: Names of the outputs, in order.
-    """
+    The inputs are those of `Scene.si_inputs`, the output is `displacement`, (B, N, D) [m]. Older
+    files are replaced.
 
-    outputs = ("displacement",)
-
-    def __init__(self, surrogate: TrainedSurrogate) -> None:
-        """Take a trained surrogate on the CPU."""
-        super().__init__()
-        self.surrogate = surrogate.eval()
-
-    @property
-    def inputs(self) -> list[str]:
-        """Names of the inputs, in order."""
-        ranges = self.surrogate.scene.loads.parameter_ranges
-        return ["force", "young", "parameters"] if ranges else ["force", "young"]
-
-    def forward(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """Return displacements (B, N, D) [m], see `TrainedSurrogate.forward`."""
-        found: Tensor = self.surrogate(force, young, parameters)
-        return found
-
-
-def export_onnx(graph: ExportGraph, path: Path) -> None:
-    """Write a graph as an ONNX file; weights above 2 GB go to `<path>.data`. Replaces older files.
+    Args:
+        surrogate: The surrogate, on the CPU.
+        path: The file.
 
     Raises:
         ValueError: The network has control flow that depends on values, or a fixed batch size.
     """
     import onnx
 
-    scene = graph.surrogate.scene
-    example = tuple(scene.si_inputs(scene.loads.sample((0, 0), range(3))).values())
-    batch = torch.export.Dim("B", min=1)
+    scene = surrogate.eval().scene
+    inputs = scene.si_inputs(scene.loads.sample((0, 0), range(3)))
+    example, batch = tuple(inputs.values()), torch.export.Dim("B", min=1)
     shapes = tuple({0: batch} for _ in example)
     # computes what a network keeps, such as blocks of K(0); gradients exclude compiled loops
-    graph(*(column.clone().requires_grad_() for column in example))
+    surrogate(*(column.clone().requires_grad_() for column in example))
     with _silence_exporter():
         try:
             # torch.onnx.export alone would fix the batch size without an error; torch.export raises
-            program = torch.export.export(graph, example, dynamic_shapes=shapes, strict=False)
+            program = torch.export.export(surrogate, example, dynamic_shapes=shapes, strict=False)
             exported = torch.onnx.export(
                 program,
                 example,
                 dynamo=True,
                 dynamic_shapes=shapes,
-                input_names=graph.inputs,
-                output_names=list(graph.outputs),
+                input_names=list(inputs),
+                output_names=["displacement"],
                 verbose=False,
             )
             assert exported is not None
         except Exception as error:  # each layer of the exporter has exceptions of its own
-            name = type(graph.surrogate.net).__name__
+            name = type(surrogate.net).__name__
             cause = next(line for line in (*str(error).splitlines(), type(error).__name__) if line)
             raise ValueError(f"{name} cannot be written as an ONNX graph: {cause}") from error
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -127,7 +107,7 @@ class OnnxSession:
         self.outputs = [one.name for one in self._session.get_outputs()]
 
     def __call__(self, **inputs: Array | Tensor) -> Array:
-        """Return displacements (B, N, D) [m] of the inputs of `ExportGraph.forward`, by name."""
+        """Return displacements (B, N, D) [m] of the inputs of the graph, by name."""
         arrays = {name: np.asarray(column) for name, column in inputs.items()}
         found: Array = self._session.run(None, arrays)[0]
         return found

@@ -12,23 +12,14 @@ from dpl.training import TrainedSurrogate
 
 @dataclass(frozen=True)
 class ResultRow:
-    """Row of `results.csv`: the prediction for one load.
+    """Row of `results.csv`: the prediction for one load; extrema are those of the nodes."""
 
-    Attributes:
-        load: Index of the load in the series.
-        young: Young's modulus [Pa].
-        max_displacement: Largest displacement of a node [m].
-        max_von_mises: Largest von Mises stress at a node [Pa].
-        min_det_F: Smallest det F at a node [-].
-        error: Relative L2 error against the finite-element solution [-]; NaN if it was not
-            computed or did not converge.
-    """
-
-    load: int
+    load: int  # index in the series
     young: float = field(metadata={"unit": "Pa"})
     max_displacement: float = field(metadata={"unit": "m"})
     max_von_mises: float = field(metadata={"unit": "Pa"})
     min_det_F: float
+    # relative L2 error of the displacement; NaN without a converged finite-element solution
     error: float = field(metadata={"unit": "%"})
 
 

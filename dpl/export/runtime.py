@@ -73,20 +73,17 @@ def write_runtime(folder: Path, surrogate: TrainedSurrogate) -> Path:
     net, scene = surrogate.net, surrogate.scene
     law = _checked_law(net, scene)
     fitted = cast(Unrolled, net)
-    arrays = {
-        **_model(fitted),
-        **_body(scene, law),
-        **_loads(scene),
-        **_error(fitted),
-        **_patches(scene.problem),
-    }
+    family = FAMILIES.get(type(scene.loads).project, "other")
+    if family == "combined" and isinstance(scene.loads, VectorLoads):
+        family = "vector"
+    arrays = _model(fitted) | _body(scene, law) | _loads(scene) | _patches(scene.problem)
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}  # 1-D at least
     words = {
         "format": FORMAT,
         "dpl": __version__,
         "scene": scene.fingerprint,
-        "law": name_of(law),
-        "loads": _family(scene),
+        "law": LAWS[type(law).invariant_derivatives] + ("" if law.finite else "_small_strains"),
+        "loads": family,
     }
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(path := folder / FILE) as file:
@@ -94,11 +91,6 @@ def write_runtime(folder: Path, surrogate: TrainedSurrogate) -> Path:
     for name in SOURCES:
         shutil.copyfile(HOME / name, folder / name)
     return path
-
-
-def name_of(law: InvariantBasedMaterial) -> str:
-    """Return the name of a law in the header."""
-    return LAWS[type(law).invariant_derivatives] + ("" if law.finite else "_small_strains")
 
 
 def with_checksum(arrays: Arrays, words: dict[str, str]) -> bytes:
@@ -129,31 +121,27 @@ def _checked_law(net: Any, scene: Scene) -> InvariantBasedMaterial:
 
 
 def _model(net: Unrolled) -> Arrays:
-    """Return the arrays of `dpl.models.unrolled.loops` and of K(0)^-1."""
+    """Return the arrays of `dpl.models.unrolled.loops`, of K(0)^-1 and of the estimated error."""
     (arrays, _), linear = net._arrays, net.linear
-    (characters, dofs, signs, scales), basis, maps = arrays
+    orbits, own = arrays.orbits, arrays._asdict()
+    del own["orbits"]
     law, inverse, _ = net._at(torch.zeros(1, 0))
     (table, unknowns, _), values = linear.blocks
     factors = np.append(linear.terms.factors(net.scene.problem.material)[0].numpy(), 1.0)
     return {
-        "characters": characters,
-        "dofs": dofs.astype(np.int32),
-        "signs": signs,
-        "scales": scales,
-        "supports": (factors @ linear._supports.numpy()).reshape(dofs.shape),
-        "columns": basis.columns.astype(np.int32),
-        "modes": basis.modes,
+        **orbits._asdict(),
+        "dofs": orbits.dofs.astype(np.int32),
+        "supports": (factors @ linear._supports.numpy()).reshape(orbits.dofs.shape),
+        **own,
+        "columns": arrays.columns.astype(np.int32),
         "reduced_inverse": inverse,
-        "gradients": maps.gradients,
-        **{name: getattr(maps, name) for name in ("rest", "entry_signs", "first_signs")},
-        "map_signs": maps.map_signs,
-        "first_map": maps.first,
-        "maps": maps.others,
-        "limits": maps.limits,
         "law_samples": law[1],
         "front_table": table,
         "front_unknowns": unknowns.astype(np.int32),
         "blocks": values,
+        "error_factor": np.array(net._doubt * math.exp(net.error_factors[0])),
+        "error_exponents": net.error_exponents[0].numpy(),
+        "least_sizes": net.least_sizes.numpy(),
     }
 
 
@@ -164,7 +152,7 @@ def _body(scene: Scene, law: InvariantBasedMaterial) -> Arrays:
         "length": np.array(scene.length),
         "force_unit": np.array(scene.force_unit),
         "young": np.array(scene.loads.moduli.middle),
-        "points": scene.length * (problem.points.numpy() + problem.origin),
+        "points": problem.points_in_metres,
         "free": problem.free.numpy().astype(np.uint8),
         "prescribed": problem.prescribed.numpy(),
         "cells": problem.cells.numpy().astype(np.int32),
@@ -176,12 +164,6 @@ def _body(scene: Scene, law: InvariantBasedMaterial) -> Arrays:
     }
 
 
-def _family(scene: Scene) -> str:
-    """Return the name of the load family in the file: modal, vector, combined or other."""
-    found = FAMILIES.get(type(scene.loads).project, "other")
-    return "vector" if found == "combined" and isinstance(scene.loads, VectorLoads) else found
-
-
 def _loads(scene: Scene) -> Arrays:
     loads, problem = scene.loads, scene.problem
     constant = loads.constant_force
@@ -190,7 +172,7 @@ def _loads(scene: Scene) -> Arrays:
         "constant_force": np.zeros(problem.shape) if constant is None else constant.numpy(),
         "loadable": loads.loadable_dofs.numpy().astype(np.uint8),
     }
-    if _family(scene) == "other":
+    if type(loads).project not in FAMILIES:
         return found
     if isinstance(loads, ModalLoads):
         shapes, span = loads.modal_forces.numpy(), (*loads._span, *loads._span, 1.0)
@@ -200,15 +182,6 @@ def _loads(scene: Scene) -> Arrays:
     nodes = np.flatnonzero((shapes != 0).any(axis=(1, 2)))
     known = {"load_nodes": nodes.astype(np.int32), "load_shapes": shapes[nodes]}
     return found | known | {"load_span": np.array(span)}
-
-
-def _error(net: Unrolled) -> Arrays:
-    """Return the estimated error of the prediction."""
-    return {
-        "error_factor": np.array(net._doubt * math.exp(net.error_factors[0])),
-        "error_exponents": net.error_exponents[0].numpy(),
-        "least_sizes": net.least_sizes.numpy(),
-    }
 
 
 def _patches(problem: Problem) -> Arrays:

@@ -88,10 +88,16 @@ def write_published(
     (folder / "checkpoints").mkdir(parents=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(dict(config), sort_keys=False))
     shutil.copy(weights, folder / "checkpoints")
-    rows = _accuracy(run / "evaluation.json")
-    for path in [*files, run / "evaluation.json", run / "shapes.png"]:
+    for path in [*files, evaluation := run / "evaluation.json", run / "shapes.png"]:
         if path.is_file():
             shutil.copy(path, folder)
+    rows = []
+    if evaluation.is_file():
+        every = json.loads(evaluation.read_text())
+        row = next(row for row in every if row["solver"] == PREDICTION)
+        median, worst = (percent(row["errors"][f"rel_L2_{name}"]) for name in ("median", "worst"))
+        shown = f"median {median} %, worst {worst} %, {row['loads']} test loads of the family above"
+        rows.append(("relative L2 error of the prediction", shown))
     tags = ["finite-elements", "hyperelasticity", "surrogate"]
     head = {"license": license.lower(), "library_name": "deepphysics", "tags": tags}
     use = (
@@ -101,18 +107,6 @@ def write_published(
     picture = "\n![Shapes of test loads](shapes.png)\n" if (folder / "shapes.png").exists() else ""
     title = "Simulator of a hyperelastic body"
     return _write_card(folder, title, scene, rows, head=head, after=use + picture)
-
-
-def _accuracy(path: Path) -> list[tuple[str, str]]:
-    """Return the errors of the prediction on the test loads, if the run was evaluated."""
-    if not path.is_file():
-        return []
-    row = next(row for row in json.loads(path.read_text()) if row["solver"] == PREDICTION)
-    errors, words = row["errors"], "relative L2 error of the prediction"
-    shown = (
-        f"median {percent(errors['rel_L2_median'])} %, worst {percent(errors['rel_L2_worst'])} %"
-    )
-    return [(words, f"{shown}, {row['loads']} test loads of the family above")]
 
 
 def _write_card(

@@ -12,14 +12,9 @@ if TYPE_CHECKING:
     from dpl.models.cnn import CNN
     from dpl.models.fcnn import FCNN
     from dpl.models.gnn import GNN
-    from dpl.models.inputs import Inputs
+    from dpl.models.interface import ClosedFormFit, HasBases, HasCorrection, Inputs
     from dpl.models.linear_base import LinearBase
     from dpl.models.pod import PODNet
-    from dpl.models.protocols import (
-        ClosedFormFit,
-        HasBases,
-        HasCorrection,
-    )
     from dpl.models.unrolled.model import Unrolled
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -8,9 +8,10 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from dpl.fem import Problem
-from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
-from dpl.models.inputs import Inputs
+from dpl.models.grid import Immersion, cubic_grid, filling, own_grid
+from dpl.models.interface import Inputs
 from dpl.scene import Scene
+from dpl.system.checks import check_range
 from dpl.system.memory import refuse_beyond
 
 COARSE = 3  # grid points per side that two convolutions connect completely
@@ -66,10 +67,9 @@ class CNN(nn.Module):
             MemoryError: Parameters and one sample would not fit.
         """
         super().__init__()
-        if channels < 1:
-            raise ValueError(f"channels = {channels} must be 1 or more")
-        if grid is not None and grid < 2:
-            raise ValueError(f"grid = {grid} must be 2 or more")
+        check_range(1, channels=channels)
+        if grid is not None:
+            check_range(2, grid=grid)
         inputs = inputs or Inputs.from_scene(scene)
         problem = scene.problem
         points, dim = problem.points, problem.shape[1]
@@ -77,19 +77,24 @@ class CNN(nn.Module):
         shape = own if own and grid in (None, max(own)) else cubic_grid(points, grid)
         sizes = _sizes(shape, steps)
         widths = [channels * 2**level for level in range(len(sizes))]
-        _refuse_beyond_memory(sizes, widths, memory_limit)
-        self.immersion = Permutation(points, shape) if shape == own else Immersion(points, shape)
-        constant = self._constant(problem, shape)
-        self.register_buffer("constant", constant, persistent=False)
+        # per level: 2 convolutions down, 2 up, and one from and to a level of twice the channels
+        parameters = sum(8 * 3**dim * width**2 for width in widths)
+        values = sum(10 * wide * math.prod(size) for size, wide in zip(sizes, widths, strict=True))
+        needed = 4 * (4 * parameters + values) / 1e9  # weights, gradients, two moments, 4 bytes
+        what = f"about {parameters:,} parameters and a grid of {' x '.join(map(str, shape))} points"
+        remedy = "take a smaller model.grid, model.channels or model.steps"
+        refuse_beyond(needed, memory_limit, what, remedy)
+        self.immersion = Immersion(points, shape)
+        self.register_buffer("constant", self._constant(problem), persistent=False)
         self.averages = inputs.is_displacement  # forces are summed
         if self.averages:
             nodes = self.immersion.spread(torch.ones(1, len(points), 1))
             self.register_buffer("share", 1 / nodes.clamp(min=1e-6), persistent=False)
         self.smooth = smooth and len(sizes) > 1
-        channels_in = dim + len(constant) + inputs.scalars
+        channels_in = dim + len(self.constant) + inputs.scalars
         self.net = UNet(channels_in, dim, sizes, widths, smooth=self.smooth)
 
-    def _constant(self, problem: Problem, shape: tuple[int, ...]) -> Tensor:
+    def _constant(self, problem: Problem) -> Tensor:
         """Return the constant channels that are not uniform, (C, *shape)."""
         fixed = (~problem.free).float()
         if (fixed == fixed[:, :1]).all():
@@ -99,29 +104,26 @@ class CNN(nn.Module):
         volume = problem.dV.expand(len(problem.cells), -1).sum()
         box = (problem.points.amax(0) - problem.points.amin(0)).prod()
         self.full = bool(volume > 0.999 * box)  # False for a grid of nodes with missing cells
-        channels = [*share] if self.full else [*share, filling(problem, shape).float()]
-        varying = [channel for channel in channels if channel.min() < channel.max()]
+        filled = [] if self.full else [filling(problem, self.immersion.shape).float()]
+        varying = [channel for channel in (*share, *filled) if channel.min() < channel.max()]
         return torch.stack(varying) if varying else share[:0]
 
     def forward(self, field: Tensor, scalars: Tensor) -> Tensor:
         """Return the scaled displacement (B, N, D) of a field (B, N, D) and scalars (B, S)."""
-        on_grid = self._on_grid(field)
+        on_grid = self.immersion.spread(field)
+        if self.averages:
+            on_grid = on_grid * self.share
         batch, sides = field.shape[0], on_grid.shape[2:]
         uniform = scalars.view(*scalars.shape, *[1] * len(sides)).expand(-1, -1, *sides)
         channels = [on_grid, self.constant.expand(batch, *self.constant.shape), uniform]
         return self.immersion.read(self.net(torch.cat(channels, 1)))
 
-    def _on_grid(self, field: Tensor) -> Tensor:
-        """Return a nodal field (B, N, D) on the grid, (B, D, *shape)."""
-        spread: Tensor = self.immersion.spread(field)
-        return spread * self.share if self.averages else spread
-
     def skipped_work(self) -> list[str]:
         """Return the work that the network saves, one line each."""
         lines = []
-        if isinstance(self.immersion, Permutation):
+        if self.immersion.corners.shape[1] == 1:
             size = " x ".join(map(str, self.immersion.shape))
-            lines.append(f"no interpolation: the nodes form a grid of {size} points")
+            lines.append(f"no interpolation: the nodes lie on a grid of {size} points")
         if self.smooth:
             lines.append("no residual blocks on the finest grid: the displacement is smooth")
         if self.full:
@@ -150,15 +152,7 @@ class UNet(nn.Module):
         *,
         smooth: bool = False,
     ) -> None:
-        """Build the network.
-
-        Args:
-            inputs: Input channels.
-            outputs: Output channels.
-            sizes: Grid points along each side, from the finest grid to the coarsest.
-            widths: Channels of each grid.
-            smooth: See `CNN`.
-        """
+        """Take numbers of channels, and points along each side of the grids, the finest first."""
         super().__init__()
         self.dim = len(sizes[0])
         self.strides = [
@@ -166,20 +160,21 @@ class UNet(nn.Module):
         ]
         conv, transposed = CONVOLUTION[self.dim], TRANSPOSED[self.dim]
         self.inlets = nn.ModuleList(conv(inputs, width, 3, 1, 1) for width in widths)
-        self.encoders = nn.ModuleList(
-            nn.Identity() if smooth and level == 0 else Residual(width, self.dim)
-            for level, width in enumerate(widths)
-        )
-        self.decoders = nn.ModuleList(
-            nn.Identity() if smooth and level == 0 else Residual(width, self.dim)
-            for level, width in enumerate(widths[:-1])
-        )
+
+        def blocks(widths: list[int]) -> nn.ModuleList:
+            found = nn.ModuleList(Residual(width, self.dim) for width in widths)
+            if smooth and widths:
+                found[0] = nn.Identity()
+            return found
+
+        self.encoders, self.decoders = blocks(widths), blocks(widths[:-1])
         self.descents, self.ascents = nn.ModuleList(), nn.ModuleList()
         levels = zip(pairwise(sizes), pairwise(widths), self.strides, strict=True)
         for (fine, coarse), (few, many), stride in levels:
             left = tuple(n - s * (m - 1) - 1 for n, m, s in zip(fine, coarse, stride, strict=True))
             self.descents.append(conv(few, many, 3, stride, 1))
             self.ascents.append(transposed(many, few, 3, stride, 1, left))
+        self.means = avg_pool3d if self.dim == 3 else avg_pool2d
         self.last = conv(widths[0], outputs, 1)
         self.rectify = nn.LeakyReLU(LEAK)
         self.apply(_initialise)
@@ -190,7 +185,8 @@ class UNet(nn.Module):
         skipped = [state]
         levels = zip(self.strides, self.descents, self.inlets[1:], self.encoders[1:], strict=True)
         for stride, descent, inlet, encoder in levels:
-            field = _means(field, stride)
+            kernel, padding = [2 * step - 1 for step in stride], [step - 1 for step in stride]
+            field = self.means(field, kernel, stride, padding, count_include_pad=False)
             state = encoder(_sum(descent(self.rectify(state)), inlet(field)))
             skipped.append(state)
         skipped.pop()
@@ -219,18 +215,10 @@ def _sum(one: Tensor, other: Tensor) -> Tensor:
     return (one + other) * math.sqrt(0.5)
 
 
-def _means(field: Tensor, stride: tuple[int, ...]) -> Tensor:
-    """Return the means over the neighbours of every second point of each side that is coarsened."""
-    kernel = tuple(2 * step - 1 for step in stride)
-    padding = tuple(step - 1 for step in stride)
-    pool = avg_pool3d if len(stride) == 3 else avg_pool2d
-    return pool(field, kernel, stride, padding, count_include_pad=False)
-
-
 def _sizes(shape: tuple[int, ...], steps: int | None) -> list[tuple[int, ...]]:
     """Return the sides of the grids, from the finest to the coarsest."""
-    if steps is not None and steps < 0:
-        raise ValueError(f"steps = {steps} must be 0 or more")
+    if steps is not None:
+        check_range(0, steps=steps)
     sizes = [shape]
     while max(sizes[-1]) > COARSE if steps is None else len(sizes) <= steps:
         if max(sizes[-1]) == 2:
@@ -254,20 +242,3 @@ def _initialise(module: nn.Module) -> None:
     nn.init.normal_(module.weight, std=math.sqrt(2 / (1 + LEAK**2) / taps))
     assert module.bias is not None
     nn.init.zeros_(module.bias)
-
-
-def _refuse_beyond_memory(
-    sizes: list[tuple[int, ...]], widths: list[int], limit: float | None
-) -> None:
-    """Raise MemoryError if float32 training on one sample would not fit."""
-    kernel = 3 ** len(sizes[0])
-    # per level: 2 convolutions down, 2 up, and one from and to a level of twice the channels
-    parameters = sum(8 * kernel * width**2 for width in widths)
-    fields = sum(10 * width * math.prod(size) for size, width in zip(sizes, widths, strict=True))
-    needed = (
-        parameters * 4 * 4 + fields * 4
-    ) / 1e9  # weights, gradients and two moments of 4 bytes
-    points = " x ".join(map(str, sizes[0]))
-    what = f"about {parameters:,} parameters and a grid of {points} points"
-    remedy = "take a smaller model.grid, model.channels or model.steps"
-    refuse_beyond(needed, limit, what, remedy)

@@ -5,8 +5,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from dpl.models.inputs import Inputs
+from dpl.models.interface import Inputs
 from dpl.scene import Scene
+from dpl.system.checks import check_range
 from dpl.system.memory import refuse_weights
 
 MAX_LAYERS = 1000
@@ -22,8 +23,6 @@ class FCNN(nn.Module):
     Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.1.1.
     """
 
-    inputs: Tensor
-    outputs: Tensor
     input_index: Tensor
     output_index: Tensor
 
@@ -54,25 +53,22 @@ class FCNN(nn.Module):
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
-        if not 2 <= layers <= MAX_LAYERS:
-            raise ValueError(f"layers = {layers} must be 2 or more and at most {MAX_LAYERS}")
-        if width is not None and width < 1:
-            raise ValueError(f"width = {width} must be 1 or more")
+        check_range(2, MAX_LAYERS, layers=layers)
+        if width is not None:
+            check_range(1, width=width)
         inputs = inputs or Inputs.from_scene(scene)
-        everything = torch.ones(scene.problem.shape, dtype=torch.bool)
-        read = everything if all_dofs else inputs.dofs
-        outputs = everything if all_dofs else scene.problem.free
-        n_outputs = int(outputs.sum())
-        sizes = [int(read.sum()) + inputs.scalars, *[width or n_outputs] * (layers - 1), n_outputs]
+        every = torch.ones(scene.problem.shape, dtype=torch.bool)
+        masks = (every, every) if all_dofs else (inputs.dofs, scene.problem.free)
+        read, written = (mask.flatten().nonzero()[:, 0] for mask in masks)
+        hidden = [width or len(written)] * (layers - 1)
+        sizes = [len(read) + inputs.scalars, *hidden, len(written)]
         self.parameters_needed = count_parameters(sizes)
-        all_sizes = [everything.numel()] * (layers + 1)
+        all_sizes = [every.numel()] * (layers + 1)
         self.parameters_saved = count_parameters(all_sizes) - self.parameters_needed
         remedy = "take a coarser mesh, model.width or another model"
         refuse_weights(self.parameters_needed, memory_limit, remedy)
-        self.register_buffer("inputs", read, persistent=False)
-        self.register_buffer("outputs", outputs, persistent=False)
-        for name, mask in {"input_index": read, "output_index": outputs}.items():
-            self.register_buffer(name, mask.flatten().nonzero()[:, 0], persistent=False)
+        self.register_buffer("input_index", read, persistent=False)
+        self.register_buffer("output_index", written, persistent=False)
         stages: list[nn.Module] = [nn.Linear(sizes[0], sizes[1])]
         for before, after in pairwise(sizes[1:]):
             stages += [nn.PReLU(before, slope), nn.Linear(before, after)]
@@ -92,8 +88,8 @@ class FCNN(nn.Module):
             return []
         return [
             f"{self.parameters_saved:,} of {self.parameters_needed + self.parameters_saved:,} "
-            f"parameters: inputs are {int(self.inputs.sum())} degrees of freedom, outputs "
-            f"{int(self.outputs.sum())} free ones"
+            f"parameters: inputs are {len(self.input_index)} degrees of freedom, outputs "
+            f"{len(self.output_index)} free ones"
         ]
 
 

@@ -1,21 +1,24 @@
 """Graph network on the nodes of the mesh and a hierarchy of clusters."""
 
+import math
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import gelu
 
-from dpl.models.graph import Graph, Integers, hierarchy, means
-from dpl.models.inputs import Inputs
-from dpl.models.message_passing import Level, Messages
-from dpl.models.stored_buffers import StoredBuffers, check_indices
+from dpl.models.graph import Floats, Graph, Integers, hierarchy, means
+from dpl.models.interface import Inputs, StoredBuffers, check_indices
 from dpl.scene import Scene
+from dpl.system.checks import check_range
 from dpl.system.memory import refuse_weights
 
 MAX_WIDTH_RATIO = 4  # width of the coarsest level over the width of the nodes
 MAX_PASSES = 1000
+CACHE = 2**17  # numbers of a block of messages that fit into the cache of a processor
 
 
 class GNN(nn.Module):
@@ -58,12 +61,8 @@ class GNN(nn.Module):
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
-        if width < 1:
-            raise ValueError(f"width = {width} must be 1 or more")
-        if levels is not None and levels < 1:
-            raise ValueError(f"levels = {levels} must be 1 or more")
-        if not 1 <= passes <= MAX_PASSES:
-            raise ValueError(f"passes = {passes} must be 1 or more and at most {MAX_PASSES}")
+        check_range(1, width=width, levels=1 if levels is None else levels)
+        check_range(1, MAX_PASSES, passes=passes)
         inputs = inputs or Inputs.from_scene(scene)
         problem = scene.problem
         nodes, dim = problem.shape
@@ -93,9 +92,8 @@ class GNN(nn.Module):
 
     def forward(self, field: Tensor, scalars: Tensor) -> Tensor:
         """Return the scaled displacement (B, N, D) of a field (B, N, D) and scalars (B, S)."""
-        states = [
-            level(*load) for level, load in zip(self.levels, self.resultants(field), strict=True)
-        ]
+        pairs = zip(self.levels, self.resultants(field), strict=True)
+        states = [level(*load) for level, load in pairs]
         if len(self.scalars) or scalars.shape[1]:  # both, or an error
             pairs = zip(states, self.scalars, strict=True)
             states = [state + encoder(scalars)[None] for state, encoder in pairs]
@@ -119,15 +117,56 @@ class GNN(nn.Module):
 
     def skipped_work(self) -> list[str]:
         """Return the work that the network saves, one line each."""
-        lines = ["no absolute positions: the prediction is invariant under translations"]
-        if len(self.sizes) > 1:
-            nodes, *clusters = map(str, self.sizes)
-            lines.append(f"multigrid hierarchy: {nodes} nodes, {', '.join(clusters)} clusters")
+        nodes, *clusters = map(str, self.sizes)
+        line = f"no clusters: {nodes} nodes with messages to neighbours only"
+        if clusters:
+            line = f"multigrid hierarchy: {nodes} nodes, {', '.join(clusters)} clusters"
         elif self.complete:
-            lines.append(f"no clusters: complete graph of {self.sizes[0]} nodes")
-        else:
-            lines.append(f"no clusters: {self.sizes[0]} nodes with messages to neighbours only")
-        return lines
+            line = f"no clusters: complete graph of {nodes} nodes"
+        return ["no absolute positions: the prediction is invariant under translations", line]
+
+
+class Level(StoredBuffers):
+    """The graph of a level as tensors, and the encoder of its inputs."""
+
+    receiver: Tensor
+    sender: Tensor
+    features: Tensor
+    flags: Tensor
+
+    def __init__(
+        self, graph: Graph, flags: Floats, nodes: int, width: int, *, first: bool, averages: bool
+    ) -> None:
+        """Build the encoder of a graph of K members of a mesh with so many nodes.
+
+        Args:
+            graph, nodes, width: The graph, nodes of the mesh, and channels of the state.
+            flags: Fractions of free degrees of freedom and of boundary nodes, (K, D + 1).
+            first: Members are the nodes of the mesh.
+            averages: The input is a displacement, whose mean over a cluster has its scale, and not
+                a force, whose sum is the resultant.
+        """
+        super().__init__()
+        count, dim = graph.points.shape
+        self.register_buffer("receiver", torch.from_numpy(graph.receiver))
+        self.register_buffer("sender", torch.from_numpy(graph.sender))
+        self.register_buffer("features", torch.from_numpy(graph.features()).float())
+        self.register_buffer("flags", torch.from_numpy(flags).float())
+        self.complete, self.first, self.spacing = graph.complete, first, graph.spacing
+        self.mean_degree = len(graph.sender) / count
+        # of forces: geometric mean of the scales of a nodal force and of the sum over a cluster
+        self.load_scale = count / nodes if averages else math.sqrt(count / nodes)
+        self.load = nn.Linear(dim if first else dim + dim * dim, width, bias=False)
+        self.place = nn.Sequential(nn.Linear(dim + 1, width), nn.GELU(), nn.Linear(width, width))
+
+    def check_buffers(self) -> None:
+        check_indices(len(self.flags), receiver=self.receiver, sender=self.sender)
+
+    def forward(self, force: Tensor, moment: Tensor) -> Tensor:
+        """Return the state (K, B, width) under forces (K, B, D) and moments (K, B, D D)."""
+        if not self.first:
+            force = torch.cat([force, moment / self.spacing], dim=-1)
+        return self.load(force * self.load_scale) + self.place(self.flags)[:, None]
 
 
 class Step(StoredBuffers):
@@ -162,6 +201,75 @@ class Step(StoredBuffers):
     def mean(self, values: Tensor) -> Tensor:
         """Return the means over members (K, B, ...) of each cluster."""
         return self.sum(values) * self.share[:, None, None]
+
+
+class Messages(nn.Module):
+    """Residual update of nodes by the filtered sum of their neighbours' states.
+
+    The filter, one number per channel, is a small network of the relative position and is the same
+    for all loads. A message is therefore a product, and the nonlinearity acts at the receiver. On a
+    complete graph the sum is a matrix product.
+
+    Source: Schuett et al. (2017), SchNet.
+    """
+
+    def __init__(self, dim: int, width: int) -> None:
+        """Take the space dimension and the width."""
+        super().__init__()
+        self.filter = nn.Sequential(nn.Linear(dim + 1, width), nn.GELU(), nn.Linear(width, width))
+        self.enter = nn.Linear(width, 2 * width)
+        self.aggregate = nn.Linear(width, width, bias=False)
+        self.leave = nn.Linear(width, width)
+
+    def forward(self, level: Level, state: Tensor) -> Tensor:
+        """Return the updated state (K, B, width)."""
+        weight = self.filter(level.features) / level.mean_degree  # (P, width)
+        sent, own = self.enter(state).chunk(2, dim=-1)
+        if level.complete:
+            matrix = weight.unflatten(0, (len(sent), len(sent))).permute(2, 0, 1)
+            received = (matrix @ sent.permute(2, 0, 1)).permute(1, 2, 0)
+        elif torch.compiler.is_compiling():  # the compiler fuses one sum, but not blocks
+            messages = sent.index_select(0, level.sender) * weight[:, None]
+            received = torch.zeros_like(sent).index_add(0, level.receiver, messages)
+        else:
+            received = NeighbourSum.apply(sent.contiguous(), weight, level.receiver, level.sender)
+        return state + self.leave(gelu(own + self.aggregate(received)))
+
+
+class NeighbourSum(torch.autograd.Function):
+    """Sums over neighbours j of i of w_ij x_j, computed in blocks of messages.
+
+    All messages together would be by far the largest tensor of the network. Blocks fit into the
+    cache and are recomputed in the backward pass.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, sent: Tensor, weight: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
+        """Return sums (K, B, width) of states (K, B, width) with weights (P, width)."""
+        ctx.save_for_backward(sent, weight, receiver, sender)
+        received = torch.zeros_like(sent)
+        for i, j, w in _blocks(sent, receiver, sender, weight):
+            received.index_add_(0, i, sent.index_select(0, j).mul_(w[:, None]))
+        return received
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        """Return the gradients with respect to states and weights."""
+        sent, weight, receiver, sender = ctx.saved_tensors
+        of_sent, of_weight = torch.zeros_like(sent), torch.empty_like(weight)
+        gradient = gradient.contiguous()
+        for i, j, w, out in _blocks(sent, receiver, sender, weight, of_weight):
+            received = gradient.index_select(0, i)
+            torch.sum(sent.index_select(0, j).mul_(received), dim=1, out=out)
+            of_sent.index_add_(0, j, received.mul_(w[:, None]))
+        return of_sent, of_weight, None, None
+
+
+def _blocks(states: Tensor, *columns: Tensor) -> Any:
+    """Return blocks of rows of the columns (P, ...) that fit into the cache."""
+    rows = CACHE // states[0].numel() if states.device.type == "cpu" else len(columns[0])
+    return zip(*(column.split(max(1, rows)) for column in columns), strict=True)
 
 
 class Pass(nn.Module):

@@ -73,12 +73,9 @@ def coarser(graph: Graph, count: int) -> tuple[Graph, Integers]:
 
     Source: Gonzalez (1985), Clustering to minimize the maximum intercluster distance.
     """
-    nodes = len(graph.points)
+    nodes, sender, centres = len(graph.points), graph.sender.tolist(), 0
     start = np.searchsorted(graph.receiver, np.arange(nodes + 1)).tolist()
-    sender = graph.sender.tolist()
-    distance = np.full(nodes, nodes, dtype=np.int64)
-    cluster = np.zeros(nodes, dtype=np.int64)
-    centres = 0
+    distance, cluster = np.full(nodes, nodes), np.zeros(nodes, np.int64)
     while centres < min(count, nodes) or distance.max() == nodes:
         front, steps = [int(distance.argmax())], 0
         while front:
@@ -88,8 +85,7 @@ def coarser(graph: Graph, count: int) -> tuple[Graph, Integers]:
             neighbours = {k for i in front for k in sender[start[i] : start[i + 1]]}
             front = sorted(k for k in neighbours if distance[k] > steps)
         centres += 1
-    members = np.bincount(cluster)
-    points = np.column_stack([np.bincount(cluster, axis) / members for axis in graph.points.T])
+    points = means(graph.points, cluster)
     if centres <= COARSEST:
         return _complete(points), cluster
     return _graph(points, cluster[graph.receiver], cluster[graph.sender]), cluster
@@ -114,7 +110,7 @@ def hierarchy(problem: Problem, levels: int | None = None) -> tuple[list[Graph],
 
 
 def means(values: Floats, cluster: Integers) -> Floats:
-    """Return the means of values (K, ...) over the members of each cluster."""
+    """Return the means of values (K, n) over the members of each cluster."""
     members = np.bincount(cluster)
     return np.column_stack([np.bincount(cluster, column) / members for column in values.T])
 

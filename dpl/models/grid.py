@@ -3,6 +3,7 @@
 import math
 from itertools import product
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -11,40 +12,14 @@ from dpl.fem import Problem
 GRID_TOL = 1e-4  # distance of a node from its grid point, in spacings; allows float32 meshes
 
 
-class Permutation(nn.Module):
-    """Transfer between a regular grid and nodes that are its points; see `Immersion`.
-
-    Attributes:
-        shape: Grid points along each side.
-    """
-
-    nodes: Tensor
-    places: Tensor
-
-    def __init__(self, points: Tensor, shape: tuple[int, ...]) -> None:
-        """Find the grid points of nodes (N, D)."""
-        super().__init__()
-        self.shape = shape
-        places = _ravel(_in_spacings(points, points, shape).round().long(), shape)
-        self.register_buffer("places", places, persistent=False)
-        self.register_buffer("nodes", places.argsort(), persistent=False)
-
-    def spread(self, values: Tensor) -> Tensor:
-        """Return nodal values (B, N, C) on the grid, (B, C, *shape)."""
-        return values[:, self.nodes].mT.unflatten(2, self.shape)
-
-    def read(self, field: Tensor) -> Tensor:
-        """Return the values of a field (B, C, *shape) at the nodes, (B, N, C)."""
-        return field.flatten(2)[:, :, self.places].mT
-
-
 class Immersion(nn.Module):
     """Multilinear interpolation from a regular grid to nodes, and its adjoint.
 
     Attributes:
         shape: Grid points along each side of the bounding box of the nodes.
-        corners: Grid points of the cell that contains a node, (N, 2^D).
-        weights: Their interpolation weights, (N, 2^D) [-], float32; they sum to 1.
+        corners: Grid points of the cell that contains a node, (N, 2^D); (N, 1) if all nodes are
+            grid points.
+        weights: Their interpolation weights [-], float32; they sum to 1.
     """
 
     corners: Tensor
@@ -54,7 +29,10 @@ class Immersion(nn.Module):
         """Find the cells that contain nodes (N, D)."""
         super().__init__()
         self.shape = shape
-        corners, weights = _stencil(_in_spacings(points, points, shape), shape)
+        place = _in_spacings(points, points, shape)
+        corners, weights = _ravel(place.round().long(), shape)[:, None], place.new_ones(1, 1)
+        if (place - place.round()).abs().max() > GRID_TOL:
+            corners, weights = _stencil(place, shape)
         self.register_buffer("corners", corners, persistent=False)
         self.register_buffer("weights", weights.float(), persistent=False)
 
@@ -149,8 +127,7 @@ def _in_spacings(where: Tensor, points: Tensor, shape: tuple[int, ...] | list[in
 
 def _ravel(place: Tensor, shape: tuple[int, ...] | list[int]) -> Tensor:
     """Return the flat indices of grid points (..., D)."""
-    strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
-    return (place * torch.tensor(strides)).sum(-1)
+    return torch.from_numpy(np.ravel_multi_index(tuple(place.numpy().T), shape).T)
 
 
 def _stencil(place: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""The linear solution as the base of a prediction."""
+"""The linear solution as the base of a prediction, and as the whitened input of a network."""
 
 from functools import cached_property
 
@@ -6,12 +6,15 @@ import torch
 from torch import Tensor
 
 from dpl.fem import Load
+from dpl.fem.rom.pod import pod
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
+from dpl.models.interface import full_precision
 from dpl.models.linear_response import LinearResponse
 from dpl.scene import Scene
 
 SCALE_STREAM = 3  # random stream of the loads for scales; samples use smaller numbers
 SCALE_LOADS = 256
+MODES = 128  # of a field that are whitened
 
 
 class LinearBase:
@@ -35,20 +38,16 @@ class LinearBase:
 
     def solve(self, load: Load) -> Tensor:
         """Return linear solutions, (B, N, D) [-], float64, on the device of the load."""
-        force = load.force.double()
-        free = self._problem.free.to(force.device)
-        if self._problem.follower_loads.ranges:
-            force = force - self._ranged_forces(load.parameters.to(force))
-        values = self._response(force[:, free], self._problem.law_parameters(load.parameters))
-        prescribed = self._problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
+        problem, force = self._problem, load.force.double()
+        free = problem.free.to(force.device)
+        if problem.follower_loads.ranges:
+            count = len(problem.material.parameter_ranges)
+            stresses = load.parameters.to(force)[:, count:] / (problem.young or 1.0)
+            force = force - torch.einsum("br,rnd->bnd", stresses, self._unit_forces.to(force))
+        values = self._response(force[:, free], problem.law_parameters(load.parameters))
+        prescribed = problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
         dofs = free.flatten().nonzero()[:, 0]
         return prescribed.index_copy(1, dofs, values).view_as(force)
-
-    def _ranged_forces(self, parameters: Tensor) -> Tensor:
-        """Return f_int at u = 0 of the follower loads with a range alone, (B, N, D) [-]."""
-        problem = self._problem
-        stresses = parameters[:, len(problem.material.parameter_ranges) :] / (problem.young or 1.0)
-        return torch.einsum("br,rnd->bnd", stresses, self._unit_forces.to(stresses))
 
     @cached_property
     def _unit_forces(self) -> Tensor:
@@ -64,3 +63,52 @@ def sampled_solutions(scene: Scene) -> tuple[Tensor, Tensor]:
     """
     force = scene.loads.sample((0, SCALE_STREAM), range(SCALE_LOADS)).force
     return force, torch.stack([scene.linear.reference.solve(one) for one in force])
+
+
+def partial_whitening(size: Tensor) -> Tensor:
+    """Return divisors (n,) of coordinates with root mean squares `size` (n,).
+
+    The divisor of a coordinate is size^0.6 times the largest size^0.4, so that small coordinates
+    are amplified less than by whitening, and rounding errors at most by 1000.
+    """
+    largest = size.max().clamp(min=1e-30)
+    return (size**0.6 * largest**0.4).clamp(min=1e-3 * float(largest))
+
+
+class FieldWhitening:
+    """Linear map of nodal fields that divides their POD coordinates by `partial_whitening`.
+
+    A few bending modes dominate displacements. Gradient descent learns the influence of the other
+    modes as much later as their coordinates are smaller; divided by their sizes all are learnt
+    together. The part of a field outside the modes is divided like the last of them, so that the
+    map is invertible.
+
+    Source: LeCun, Bottou, Orr, Mueller (1998), Efficient BackProp, section 4.3 (decorrelated inputs
+    of equal variance).
+    """
+
+    def __init__(self, fields: Tensor, free: Tensor) -> None:
+        """Compute the modes of fields (S, N, D), which count at `free` (N, D) only."""
+        columns = fields[:, free].double()
+        vectors = pod(columns, min(MODES, *columns.shape)).vectors
+        size = (columns @ vectors).square().mean(dim=0).sqrt()
+        kept = size > 1e-6 * size.max()
+        vectors, size = vectors[:, kept], size[kept]
+        factors = 1 / partial_whitening(size)
+        outside = (columns - columns @ vectors @ vectors.T) * factors[-1]
+        square = (factors * size).square().sum() + outside.square().sum(dim=1).mean()
+        factors = factors / (square / len(vectors)).sqrt()  # the mean square of a result is one
+        modes = vectors.new_zeros(len(factors), free.numel())
+        modes[:, free.flatten()] = vectors.T
+        self._on_device = {modes.device: (modes.float(), factors.float())}
+
+    def __call__(self, field: Tensor) -> Tensor:
+        """Return whitened fields, (B, N, D), of fields (B, N, D) of any precision."""
+        if field.device not in self._on_device:
+            modes, factors = next(iter(self._on_device.values()))
+            self._on_device[field.device] = modes.to(field.device), factors.to(field.device)
+        modes, factors = (part.to(field.dtype) for part in self._on_device[field.device])
+        with full_precision(field.device.type):  # rounding errors would be amplified
+            coordinates = field.flatten(1) @ modes.T
+            amplified = (coordinates * (factors - factors[-1])) @ modes
+        return factors[-1] * field + amplified.view_as(field)

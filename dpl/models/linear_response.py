@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,6 @@ from torch.nn.functional import pad
 
 from dpl.fem.linear.condensation import (
     Condensed,
-    Layer,
     condense,
     condensed_layers,
     condensed_solves,
@@ -27,12 +26,13 @@ from dpl.fem.materials.material import Material
 from dpl.fem.solvers.parity_factor import OrbitForm, TermMatrices
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import SymmetryGroup
-from dpl.models.precision import full_precision
+from dpl.models.interface import full_precision
 from dpl.scene import Scene
 from dpl.system.threads import on_threads
 
 Array = NDArray[np.float64]
 Parts = NDArray[Any]  # values by parity in the type of the blocks, (M, m)
+Solve = Callable[[Array], tuple[float, Parts, Parts]]  # see `LinearResponse.at`
 MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are float32 [-]
 FEW = 8  # loads that compiled loops solve faster than products of matrices do
 MAX_VALUES = 2**26  # of a batch that are computed at a time by tensor operations
@@ -58,16 +58,11 @@ class OrbitArrays(NamedTuple):
 def split_force(orbits, force, support, parts):  # type: ignore[no-untyped-def]
     """Set parts (M, m) to f - s over a unit by parity, and return this unit.
 
-    The unit is the largest entry, so that parts in float32 neither underflow nor overflow.
-
-    Args:
-        orbits: See `OrbitArrays`.
-        force: f, (N D,).
-        support: s by parity, (M, m).
-        parts: (M, m).
+    The unit is the largest entry, so that parts in float32 neither underflow nor overflow. The
+    force f is (N D,), the force of the supports s is given by parity, (M, m).
     """
     M, m = orbits.dofs.shape
-    whole, own, unit = -support, np.empty(m), 0.0
+    whole, own = -support, np.empty(m)
     for g in range(M):
         for j in range(m):
             own[j] = orbits.scales[g, j] * force[orbits.dofs[g, j]]
@@ -75,13 +70,9 @@ def split_force(orbits, force, support, parts):  # type: ignore[no-untyped-def]
             factor = orbits.characters[p, g]
             for j in range(m):
                 whole[p, j] += factor * own[j]
-    for p in range(M):
-        for j in range(m):
-            unit = max(unit, abs(whole[p, j]))
+    unit = np.abs(whole).max()
     unit = unit if unit > 0.0 else 1.0
-    for p in range(M):
-        for j in range(m):
-            parts[p, j] = whole[p, j] / unit
+    parts[:] = whole / unit
     return unit
 
 
@@ -106,23 +97,22 @@ class LinearResponse:
         Raises:
             ValueError: K(0) changes too much with the parameters, see `StiffnessTerms`.
         """
-        self._scene, self._group = scene, group
+        self.scene, self.group = scene, group
         self.terms.require_few_steps()
-        self._orbits_on: dict[torch.device, _Orbits] = {}
-        self._blocks_on: dict[torch.device, _Blocks] = {}
+        self._kept: dict[tuple[torch.device, str], list[Any]] = {}
 
     # ------------------------------------------------------------------ blocks
 
     @cached_property
     def terms(self) -> StiffnessTerms:
         """Terms of K(0) of the body."""
-        problem = self._scene.problem
+        problem = self.scene.problem
         return StiffnessTerms.of(replace(problem, follower_loads=problem.follower_loads.constant))
 
     @cached_property
     def form(self) -> OrbitForm:
         """Values of each orbit of degrees of freedom, by which K(0) is stored."""
-        return OrbitForm.of(self._scene.problem.reference, self._group)
+        return OrbitForm.of(self.scene.problem.reference, self.group)
 
     @cached_property
     def blocks(self) -> Condensed:
@@ -130,10 +120,13 @@ class LinearResponse:
 
         They are float64 if the solutions of random forces lose more than `MAX_ROUNDING`.
         """
-        matrices = self.form.matrices(self.terms.node_body)
-        exact = condense(matrices, self.form.points)
+        matrices, points = self.form.matrices(self.terms.node_body), self.form.points
+        exact = condense(matrices, points)
         rounded = exact._replace(values=exact.values.astype(np.float32))
-        return rounded if _difference(rounded, exact) < MAX_ROUNDING else exact
+        forces = np.random.default_rng(0).standard_normal((len(matrices), len(points)))
+        one, other = (_solutions(blocks, forces).astype(float) for blocks in (rounded, exact))
+        loss = norm(one - other, axis=1) / norm(other, axis=1)
+        return rounded if loss.max() < MAX_ROUNDING else exact
 
     @cached_property
     def _matrices(self) -> TermMatrices:
@@ -142,7 +135,7 @@ class LinearResponse:
     @cached_property
     def _supports(self) -> Tensor:
         """Forces of `StiffnessTerms.support_forces` by parity, (T + 1, M m)."""
-        forces = self.terms.support_forces()[:, self._scene.problem.free.cpu()]
+        forces = self.terms.support_forces()[:, self.scene.problem.free.cpu()]
         return torch.stack([self.form.parts(force).flatten() for force in forces])
 
     # ------------------------------------------------------------------ one load
@@ -151,12 +144,12 @@ class LinearResponse:
     def orbits(self) -> OrbitArrays:
         """Degrees of freedom of the orbits for compiled loops."""
         parities, orbits, _ = self.form
-        dofs = self._scene.problem.free.flatten().nonzero()[:, 0].numpy()
+        dofs = self.scene.problem.free.flatten().nonzero()[:, 0].numpy()
         signs = orbits.sign.numpy()
         scales = signs * orbits.weight.numpy()
         return OrbitArrays(parities.characters.numpy(), dofs[orbits.images.numpy()], signs, scales)
 
-    def at(self, law: Material) -> Callable[[Array], tuple[float, Parts, Parts]]:
+    def at(self, law: Material) -> Solve:
         """Return the function from forces f (N, D) to linear solutions.
 
         It returns a unit and, over this unit and by parity, f - s and K(0)^-1 (f - s), (M, m).
@@ -177,26 +170,18 @@ class LinearResponse:
 
     def _inverse(self, factors: Array) -> Callable[[Parts], Parts]:
         """Return f -> K(0)^-1 f, (M, m) each, of factors and 1, (T + 1,); f is of order one."""
-        (table, unknowns, _), values = self.blocks
-        shape = self.orbits.dofs.shape
-
-        def of_node(parts: Parts) -> Parts:
-            found = np.empty_like(parts)
-            condensed_solves(table, unknowns, values, parts.copy(), found)
-            return found
-
         if not self.terms.varies:
-            return of_node
+            return partial(_solutions, self.blocks)
+        shape, dtype = self.orbits.dofs.shape, self.blocks.values.dtype
         matrix, ends = self._matrices.at(factors), (self.terms.rtol, self.terms.max_steps)
 
         def precondition(residual: Array) -> Array:
-            found = of_node(residual.reshape(shape).astype(values.dtype))
-            return found.astype(np.float64).ravel()
+            return _solutions(self.blocks, residual.reshape(shape)).astype(np.float64).ravel()
 
         def solve(parts: Parts) -> Parts:
             right = parts.astype(np.float64).ravel()
             found = conjugate_gradients(matrix.dot, precondition, right, *ends, natural=True)
-            return found.reshape(shape).astype(values.dtype)
+            return found.reshape(shape).astype(dtype)
 
         return solve
 
@@ -209,19 +194,19 @@ class LinearResponse:
             loaded: Forces at free degrees of freedom, (B, n).
             parameters: Parameters of the law, (B, P).
         """
-        own = self._orbits(loaded.device)
-        law = self._scene.problem.material.with_parameters(parameters)
+        images, signs, scales, characters, supports, places = self._orbits(loaded.device)
+        law = self.scene.problem.material.with_parameters(parameters)
         factors = self.terms.factors(law).double().expand(loaded.shape[0], -1)
         factors = pad(factors, (0, 1), value=1.0)
         with full_precision(loaded.device.type):
-            parts = own.characters @ (own.scales * loaded.double()[:, own.images])  # (B, M, m)
-            right = parts.flatten(1) - factors @ own.supports
+            parts = characters @ (scales * loaded.double()[:, images])  # (B, M, m)
+            right = parts.flatten(1) - factors @ supports
             if torch.compiler.is_compiling():
                 solved = self.by_tensors(right, factors)
             else:
                 solved = _Solve.apply(right, factors, self)
-            values = own.signs * (own.characters.T @ solved.view_as(parts))
-        return values.flatten(1)[:, own.places].to(loaded)
+            values = signs * (characters.T @ solved.view_as(parts))
+        return values.flatten(1)[:, places].to(loaded)
 
     def solve(self, right: Tensor, factors: Tensor) -> Tensor:
         """Return K(0)^-1 f, (B, M m), without derivatives.
@@ -241,83 +226,61 @@ class LinearResponse:
 
     def by_tensors(self, right: Tensor, factors: Tensor) -> Tensor:
         """Return the same as `solve` by tensor operations."""
-        own = self._tensors(right.device)
-        count = max(1, MAX_VALUES // max(own.columns.numel(), self.blocks.values.size))
-        if torch.compiler.is_compiling() or right.shape[0] <= count:
-            return self._batch_by_tensors(right, factors)
-        both = zip(right.split(count), factors.split(count), strict=True)
-        return torch.cat([self._batch_by_tensors(*pair) for pair in both])
-
-    def _batch_by_tensors(self, right: Tensor, factors: Tensor) -> Tensor:
-        own = self._tensors(right.device)
-        count, dtype = len(self.blocks.values), own.layers[0].inverse.dtype
+        layers, columns, entries = self.tensors(right.device)
+        count = max(1, MAX_VALUES // max(columns.numel(), self.blocks.values.size))
+        if not torch.compiler.is_compiling() and right.shape[0] > count:
+            both = zip(right.split(count), factors.split(count), strict=True)
+            return torch.cat([self.by_tensors(*pair) for pair in both])
 
         def of_node(f: Tensor) -> Tensor:
-            forces = f.unflatten(1, (count, -1)).transpose(0, 1).to(dtype)
-            return solve_layers(own.layers, forces).transpose(0, 1).flatten(1).double()
+            forces = f.unflatten(1, (len(self.blocks.values), -1)).transpose(0, 1)
+            solved = solve_layers(layers, forces.to(layers[0].inverse.dtype))
+            return solved.transpose(0, 1).flatten(1).double()
 
         if not self.terms.varies:
             size = _largest(right)
             return of_node(right / size) * size
-        matrix = torch.einsum("bk,knw->bnw", factors, own.entries)
+        matrix = torch.einsum("bk,knw->bnw", factors, entries)
 
         def product(x: Tensor) -> Tensor:
-            return (matrix * x[:, own.columns]).sum(dim=-1)
+            return (matrix * x[:, columns]).sum(dim=-1)
 
         ends = self.terms.rtol, self.terms.max_steps
         return conjugate_gradients_of_tensors(product, of_node, right, *ends)
 
-    def products(self, x: Tensor) -> Tensor:
-        """Return the product of each term with x (B, M m), (B, T + 1, M m)."""
-        own = self._tensors(x.device)
-        return torch.einsum("bnw,knw->bkn", x[:, own.columns], own.entries)
+    def _orbits(self, device: torch.device) -> list[Tensor]:
+        """Return images, signs, scales, characters and forces of supports, see `OrbitArrays`.
 
-    def _orbits(self, device: torch.device) -> "_Orbits":
-        if device not in self._orbits_on:
+        The last one is the position of each free degree of freedom among the images, (n,).
+        """
+
+        def make() -> list[Tensor]:
             parities, orbits, _ = self.form
             places = torch.empty(int(orbits.images.max()) + 1, dtype=torch.int64)
             places[orbits.images.flatten()] = torch.arange(orbits.images.numel())
             scales = orbits.sign * orbits.weight
-            own = orbits.images, orbits.sign, scales, parities.characters, places, self._supports
-            made = _Orbits(*(part.to(device) for part in own))
-            if torch.compiler.is_compiling():
-                return made
-            self._orbits_on[device] = made
-        return self._orbits_on[device]
+            own = orbits.images, orbits.sign, scales, parities.characters, self._supports, places
+            return [part.to(device) for part in own]
 
-    def _tensors(self, device: torch.device) -> "_Blocks":
-        if device not in self._blocks_on:
-            columns, entries = torch.zeros(0, dtype=torch.int64), torch.zeros(0)
-            if self.terms.varies:
-                columns, entries = self._matrices.padded()
-            layers = condensed_layers(self.blocks, device)
-            made = _Blocks(layers, columns.to(device), entries.to(device))
-            if torch.compiler.is_compiling():  # tensors of a traced graph have no values
-                return made
-            self._blocks_on[device] = made
-        return self._blocks_on[device]
+        return self._on(device, "orbits", make)
 
+    def tensors(self, device: torch.device) -> list[Any]:
+        """Return the layers of the node, and columns and entries of `TermMatrices.padded`."""
 
-class _Orbits(NamedTuple):
-    """Orbits on one device; scales are signs times weights, (M, m); n free degrees of freedom.
+        def make() -> list[Any]:
+            terms = self._matrices.padded() if self.terms.varies else (torch.zeros(0).long(),) * 2
+            return [condensed_layers(self.blocks, device), *(part.to(device) for part in terms)]
 
-    `places` (n,) is the position of each degree of freedom among the images.
-    """
+        return self._on(device, "blocks", make)
 
-    images: Tensor
-    signs: Tensor
-    scales: Tensor
-    characters: Tensor
-    places: Tensor
-    supports: Tensor
-
-
-class _Blocks(NamedTuple):
-    """Blocks of the node and terms of K(0) on one device, see `TermMatrices.padded`."""
-
-    layers: list[Layer]
-    columns: Tensor
-    entries: Tensor
+    def _on(self, device: torch.device, name: str, make: Callable[[], list[Any]]) -> list[Any]:
+        """Return tensors, kept for a device unless a graph is traced, whose tensors lack values."""
+        if (device, name) in self._kept:
+            return self._kept[device, name]
+        made = make()
+        if not torch.compiler.is_compiling():
+            self._kept[device, name] = made
+        return made
 
 
 class _Solve(Function):
@@ -336,7 +299,8 @@ class _Solve(Function):
         right: Tensor = _Solve.apply(gradients[0], factors, ctx.response)
         of_factors = None
         if ctx.needs_input_grad[1] and ctx.response.terms.varies:
-            of_factors = -torch.einsum("bn,bkn->bk", right, ctx.response.products(x))
+            _, columns, entries = ctx.response.tensors(x.device)
+            of_factors = -torch.einsum("bn,bnw,knw->bk", right, x[:, columns], entries)
         return right, of_factors, None
 
 
@@ -346,13 +310,9 @@ def _largest(right: Tensor) -> Tensor:
     return torch.where(size > 0, size, 1.0)
 
 
-def _difference(blocks: Condensed, exact: Condensed) -> float:
-    """Return the largest relative difference of solutions of random forces [-]."""
-    shape = len(exact.values), len(np.unique(exact.fronts.unknowns))
-    random, found = np.random.default_rng(0).standard_normal(shape), []
-    for one in (blocks, exact):
-        table, unknowns, _ = one.fronts
-        forces = random.astype(one.values.dtype)
-        condensed_solves(table, unknowns, one.values, forces, solutions := np.empty_like(forces))
-        found.append(solutions.astype(np.float64))
-    return float((norm(found[0] - found[1], axis=1) / norm(found[1], axis=1)).max())
+def _solutions(blocks: Condensed, forces: Parts) -> Parts:
+    """Return the solutions of forces, (M, m) each, in the type of the blocks."""
+    (table, unknowns, _), values = blocks
+    solutions = np.empty(forces.shape, values.dtype)
+    condensed_solves(table, unknowns, values, forces.astype(values.dtype), solutions)
+    return solutions

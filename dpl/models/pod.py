@@ -6,10 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem.rom.pod import orthonormal_fields, pod
-from dpl.models.inputs import Inputs
-from dpl.models.precision import full_precision
-from dpl.models.whitening import partial_whitening, root_mean_square
+from dpl.models.interface import Inputs, full_precision
+from dpl.models.linear_base import partial_whitening
 from dpl.scene import Scene
+from dpl.system.checks import check_range
 from dpl.system.memory import refuse_weights
 
 MAX_BLOCKS = 1000
@@ -78,11 +78,8 @@ class PODNet(nn.Module):
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
-        for name, number in {"rank": rank, "coordinates": coordinates, "width": width}.items():
-            if number < 1:
-                raise ValueError(f"{name} = {number} must be 1 or more")
-        if not 0 <= blocks <= MAX_BLOCKS:
-            raise ValueError(f"blocks = {blocks} must be 0 or more and at most {MAX_BLOCKS}")
+        check_range(1, rank=rank, coordinates=coordinates, width=width)
+        check_range(0, MAX_BLOCKS, blocks=blocks)
         self.scene = scene
         inputs = inputs or Inputs.from_scene(scene)
         rank = min(rank, int(scene.problem.free.sum()))
@@ -124,10 +121,11 @@ class PODNet(nn.Module):
         weight = (size.clamp(min=1e-12) ** -0.5 * (size > 0))[:, None]
         modes = _modes(weight * output, len(self.modes))
         self.modes.copy_(modes.T)
-        size = root_mean_square(output @ modes)
+        size = (output @ modes).square().mean(dim=0).sqrt()
         self.output_scale.copy_((size * size.max()).sqrt())
         modes = _modes(weight * field, self.projection.shape[1])
-        self.projection.copy_(modes / partial_whitening(root_mean_square(field @ modes)))
+        size = (field @ modes).square().mean(dim=0).sqrt()
+        self.projection.copy_(modes / partial_whitening(size))
 
     @property
     def vectors(self) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dpl.data.datamodule import DataModule
 from dpl.fem import Load
-from dpl.models.protocols import ClosedFormFit
+from dpl.models.interface import ClosedFormFit
 from dpl.scene import Sample
 from dpl.training import checkpoints
 from dpl.training.callbacks.tensorboard import LogHyperparameters

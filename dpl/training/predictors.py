@@ -13,11 +13,8 @@ from torch.utils.data import Dataset
 from dpl.data.samples import Samples
 from dpl.fem import Load, SubspaceNewton
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
-from dpl.models.inputs import Base, Inputs
-from dpl.models.linear_base import LinearBase, sampled_solutions
-from dpl.models.protocols import HasBases, HasCorrection
-from dpl.models.stored_buffers import StoredBuffers
-from dpl.models.whitening import FieldWhitening
+from dpl.models.interface import Base, HasBases, HasCorrection, Inputs, StoredBuffers
+from dpl.models.linear_base import FieldWhitening, LinearBase, sampled_solutions
 from dpl.scene import Sample, Scene
 
 if TYPE_CHECKING:  # the losses import Lightning, which a loaded run does not need

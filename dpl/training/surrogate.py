@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
-from dpl.models.inputs import Base, Inputs
+from dpl.models.interface import Base, Inputs
 from dpl.scene import Sample, Scene
 from dpl.training import checkpoints
 from dpl.training.callbacks.averaged_weights import AveragedWeights

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem import Load
-from dpl.models.inputs import Base
+from dpl.models.interface import Base, HasCorrection
 from dpl.models.linear_base import SCALE_STREAM
-from dpl.models.protocols import HasCorrection
 from dpl.scene import Scene
 from dpl.training.predictors import predictor_of
 

@@ -4,6 +4,7 @@ import ctypes
 import shutil
 import subprocess
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,26 +12,15 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
-from dpl.export.runtime import FILE, FORMAT, HOME, LAWS, name_of, with_checksum, write_runtime
-from dpl.fem import (
-    DemirayK2,
-    DirichletBC,
-    ModalLoads,
-    NeoHookeanLn,
-    Newton,
-    Plane,
-    Problem,
-    RobinBC,
-    box,
-    estimate_error,
-    rectangle,
-    solve,
-)
+import dpl.fem as fem
+from benchmarks.samples import solved
+from dpl.export.runtime import FILE, FORMAT, HOME, LAWS, with_checksum, write_runtime
+from dpl.fem.rom.pod import scatter_fields
 from dpl.models import Unrolled
 from dpl.models.unrolled.compiled import law_arguments
 from dpl.models.unrolled.features import SampleCells
 from dpl.models.unrolled.fit import Maps
-from dpl.scene import Sample, Scene
+from dpl.scene import Scene
 from dpl.training import MSE, Surrogate
 from tests.laws import LAWS as ALL_LAWS
 
@@ -40,7 +30,7 @@ RUNTIME_LAWS = {
     name: law
     for name, law in ALL_LAWS.items()
     if getattr(type(law), "invariant_derivatives", None) in LAWS
-} | {"demiray": DemirayK2(a=0.4, b=2.0, poisson=0.3).normalised()}
+} | {"demiray": fem.DemirayK2(a=0.4, b=2.0, poisson=0.3).normalised()}
 OPENED = """
 #include <iomanip>
 #include <iostream>
@@ -91,33 +81,34 @@ class Body:
         return displacement, surface, report
 
 
+CHECKS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DDPL_SCALAR"]
+PROGRAMS = {  # options and source: with SIMD, checked without it, and the example
+    "library": ["-O2", "-shared", "-fPIC", str(HOME / "dpl_c.cpp")],
+    "opened": ["-O0", *CHECKS, "opened.cpp"],
+    "loop": ["-O0", str(HOME / "loop.cpp")],
+}
+
+
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory):
-    """A library with SIMD, a checked program without it, and the example, compiled at once."""
+    """Function that returns the path of a program, which is compiled when it is first used."""
     folder = tmp_path_factory.mktemp("programs")
     (folder / "opened.cpp").write_text(OPENED)
-    common = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{HOME}"]
-    checks = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DDPL_SCALAR"]
-    commands = {
-        "library": ["-O2", "-shared", "-fPIC", str(HOME / "dpl_c.cpp")],
-        "opened": ["-O0", *checks, str(folder / "opened.cpp")],
-        "loop": ["-O0", str(HOME / "loop.cpp")],
-    }
-    started = {
-        name: subprocess.Popen(
-            [*common, *options, "-o", str(folder / name)], stderr=subprocess.PIPE, text=True
-        )
-        for name, options in commands.items()
-    }
-    for process in started.values():
-        message = process.communicate()[1]
-        assert process.returncode == 0, message
-    return folder
+
+    @cache
+    def programs(name):
+        command = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{HOME}"]
+        command += [*PROGRAMS[name], "-o", name]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
+        assert done.returncode == 0, done.stderr
+        return folder / name
+
+    return programs
 
 
 @pytest.fixture(scope="module")
 def library(programs):
-    found = ctypes.CDLL(str(programs / "library"))
+    found = ctypes.CDLL(str(programs("library")))
     pointer, text, number = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int
     for name, result, *arguments in (
         ("dpl_open", pointer, text),
@@ -138,23 +129,17 @@ def library(programs):
 
 def scene_on(mesh, law=None, **options):
     """Return a scene of a body that is held where x is smallest."""
-    law = NeoHookeanLn(0.3) if law is None else law
-    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), young=2e3, **options)
-    newton = Newton(problem, linear="superlu")
-    loads = ModalLoads(newton.linear_solver, n_modes=3, deflection=0.2, young=2e3)
+    law = fem.NeoHookeanLn(0.3) if law is None else law
+    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), young=2e3, **options)
+    newton = fem.Newton(problem, linear="superlu")
+    loads = fem.ModalLoads(newton.linear_solver, n_modes=3, deflection=0.2, young=2e3)
     return Scene(problem, loads, newton)
-
-
-def samples_of(scene, count, seed):
-    load = scene.loads.sample(seed, range(count))
-    states = [solve(scene.solver, one).displacement for one in load.unbatch()]
-    return Sample(load.force, torch.cat(states), load.young, load.parameters)
 
 
 def surrogate_of(scene):
     """Return a fitted model of a scene."""
     net = Unrolled(scene, rank=20, cells=8, stages=2)
-    net.fit(samples_of(scene, 30, 0), samples_of(scene, 8, 1))
+    net.fit(*(solved(scene, scene.loads.sample(k, range(n))) for k, n in enumerate((30, 8))))
     return Surrogate(net, MSE(), scene).eval()
 
 
@@ -165,14 +150,14 @@ def sheared(points):
 
 
 BODIES = {
-    "equal hexahedra, eight symmetries": lambda: scene_on(box((4, 1, 1), (5, 3, 3))),
+    "equal hexahedra, eight symmetries": lambda: scene_on(fem.box((4, 1, 1), (5, 3, 3))),
     "hexahedra without symmetry": lambda: scene_on(
-        (mesh := box((3, 1, 1), (4, 3, 3))).__class__(sheared(mesh.p), mesh.t)
+        (mesh := fem.box((3, 1, 1), (4, 3, 3))).__class__(sheared(mesh.p), mesh.t)
     ),
-    "quadratic tetrahedra": lambda: scene_on(box((2, 1, 1), (3, 2, 2), "tetra"), degree=2),
+    "quadratic tetrahedra": lambda: scene_on(fem.box((2, 1, 1), (3, 2, 2), "tetra"), degree=2),
     "a moved end": lambda: scene_on(
-        box((4, 1, 1), (5, 3, 3)),
-        supports=[DirichletBC(Plane(0, "max"), [0.0, 0.1, None])],
+        fem.box((4, 1, 1), (5, 3, 3)),
+        supports=[fem.DirichletBC(fem.Plane(0, "max"), [0.0, 0.1, None])],
     ),
 }
 
@@ -185,10 +170,16 @@ def body(request, library, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def beam(library, tmp_path_factory):
+def written(tmp_path_factory):
     """The beam with an estimated error, and its file."""
     surrogate = surrogate_of(BODIES["equal hexahedra, eight symmetries"]())
-    path = write_runtime(tmp_path_factory.mktemp("beam"), surrogate)
+    return surrogate, write_runtime(tmp_path_factory.mktemp("beam"), surrogate)
+
+
+@pytest.fixture(scope="module")
+def beam(library, written):
+    """The beam, its body in C++, and its file."""
+    surrogate, path = written
     return surrogate, Body(library, path), path
 
 
@@ -238,16 +229,17 @@ def test_laws_equal_those_of_python(beam, library, tmp_path, name):
     net, scene, law = surrogate.net, surrogate.scene, RUNTIME_LAWS[name]
     constants = law_arguments(law)[1]
     arrays = load_file(path) | {"law_samples": constants, "law_cells": constants[:, :-2].copy()}
-    words = WORDS | {"law": name_of(law)}
+    kind = LAWS[type(law).invariant_derivatives] + ("" if law.finite else "_small_strains")
+    words = WORDS | {"law": kind}
     (changed := tmp_path / FILE).write_bytes(with_checksum(arrays, words))
     cpp, problem = Body(library, changed), replace(scene.problem, material=law)
     loads = scene.loads.sample(3, range(2))
     loaded, factors = loads.force[:, problem.free], net.linear.terms.factors(scene.problem.material)
     galerkin = net._stiffness.solve(factors, loaded @ net.modes.double())
-    maps = net.first_map.double(), list(net.maps.double())
-    coordinates, _ = Maps(SampleCells(net.gradients), *maps, net.limits)(law, galerkin)
-    linear = net.linear(loaded, loads.parameters)
-    predicted = net._field(linear + net._at_free_dofs(coordinates))
+    maps = [net.first_map.double(), *net.maps.double()]
+    coordinates, _ = Maps(SampleCells(net.gradients), maps, net.limits)(law, galerkin)
+    columns = net.linear(loaded, loads.parameters) + coordinates @ net.modes.mT.double()
+    predicted = scatter_fields(columns, problem.free)
     for k, force in enumerate(scene.si_inputs(loads)["force"].numpy()):
         displacement, _, report = cpp.solve(force)
         u = torch.from_numpy(displacement)[None] / scene.length
@@ -277,7 +269,7 @@ def test_the_error_out_of_range_is_that_of_the_rotated_stiffness(beam):
     displacement, _, report = cpp.solve(scene.si_inputs(load)["force"][0].numpy())
     u = torch.from_numpy(displacement)[None] / scene.length
     assert report.range == 0
-    expected = estimate_error(scene.linear, load, u, products=0).error
+    expected = fem.estimate_error(scene.linear, load, u, products=0).error
     assert report.error == pytest.approx(expected, rel=1e-3)
 
 
@@ -316,7 +308,7 @@ def test_a_force_that_is_not_finite_is_an_error(beam, library):
 
 def opened(programs, *paths):
     """Return the lines of the checked program, one for each file."""
-    command = [str(programs / "opened"), *map(str, paths)]
+    command = [programs("opened"), *paths]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
@@ -335,8 +327,8 @@ def test_the_file_is_safetensors_and_read_without_simd_too(beam, programs):
         assert float(line) == pytest.approx(expected, rel=1e-9)
 
 
-def test_damaged_files_end_in_one_line(beam, programs, tmp_path):
-    content, random = beam[2].read_bytes(), np.random.default_rng(0)
+def test_damaged_files_end_in_one_line(written, programs, tmp_path):
+    content, random = written[1].read_bytes(), np.random.default_rng(0)
     header = 8 + int.from_bytes(content[:8], "little")
     damaged = [content[:size] for size in (0, 7, 8, 9, header - 1, header, len(content) - 1)]
     damaged += [content[:size] for size in random.integers(0, len(content), 8)]
@@ -360,6 +352,8 @@ def test_damaged_files_end_in_one_line(beam, programs, tmp_path):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
+        ({"law": "ogden"}, None),
+        ({"format": "dpl runtime 0"}, None),
         ("cells", lambda a: a + 1000),
         ("dofs", lambda a: a - 10_000),
         ("columns", lambda a: a + 1000),
@@ -383,40 +377,38 @@ def test_damaged_files_end_in_one_line(beam, programs, tmp_path):
         ("blocks", lambda a: a[:, :-1].copy()),
     ],
 )
-def test_arrays_that_do_not_fit_end_in_one_line(beam, programs, tmp_path, name, change):
-    arrays = load_file(beam[2])
-    changed = np.ascontiguousarray(change(arrays[name]))
-    (path := tmp_path / FILE).write_bytes(with_checksum(arrays | {name: changed}, WORDS))
+def test_words_and_arrays_that_do_not_fit_end_in_one_line(
+    written, programs, tmp_path, name, change
+):
+    arrays, words = load_file(written[1]), WORDS
+    if change is None:
+        words = WORDS | name
+    else:
+        arrays[name] = np.ascontiguousarray(change(arrays[name]))
+    (path := tmp_path / FILE).write_bytes(with_checksum(arrays, words))
     (line,) = opened(programs, path)
-    assert line.startswith("error: runtime file ")
+    assert line.startswith("error: " if change is None else "error: runtime file ")
 
 
-@pytest.mark.parametrize("words", [{"law": "ogden"}, {"format": "dpl runtime 0"}])
-def test_other_laws_and_formats_are_refused(beam, programs, tmp_path, words):
-    (path := tmp_path / FILE).write_bytes(with_checksum(load_file(beam[2]), WORDS | words))
-    (line,) = opened(programs, path)
-    assert line.startswith("error: ")
-
-
-def test_the_example_prints_error_and_time_of_each_frame(beam, programs):
-    command = [str(programs / "loop"), str(beam[2]), "3", "0.5"]
+def test_the_example_prints_error_and_time_of_each_frame(written, programs):
+    command = [programs("loop"), written[1], "3", "0.5"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     head, names, *frames = done.stdout.splitlines()
     assert head == "45 nodes, 42 of the surface"
     assert [len(frame.split()) for frame in frames] == [len(names.split())] * 3
-    missing = subprocess.run([programs / "loop", "none"], capture_output=True, text=True)
+    missing = subprocess.run([programs("loop"), "none"], capture_output=True, text=True)
     assert (missing.returncode, missing.stderr) == (1, "error: none cannot be read\n")
 
 
 # ---------------------------------------------------------------- bodies that it cannot simulate
 
 
-BEAM = box((2, 1, 1), (3, 2, 2))
-FOUNDATION = RobinBC(Plane(1, "min"), 1.0)
+BEAM = fem.box((2, 1, 1), (3, 2, 2))
+FOUNDATION = fem.RobinBC(fem.Plane(1, "min"), 1.0)
 REFUSED = {
-    "three-dimensional": lambda: scene_on(rectangle((4, 1), (5, 2))),
-    r"no ranges \['poisson'\]": lambda: scene_on(BEAM, NeoHookeanLn((0.1, 0.4))),
+    "three-dimensional": lambda: scene_on(fem.rectangle((4, 1), (5, 2))),
+    r"no ranges \['poisson'\]": lambda: scene_on(BEAM, fem.NeoHookeanLn((0.1, 0.4))),
     "one of the laws": lambda: scene_on(BEAM, ALL_LAWS["ogden_k2"]),
     "no elastic foundation": lambda: scene_on(BEAM, supports=[FOUNDATION]),
     "no mean dilatation": lambda: scene_on(BEAM, mean_dilatation=True),

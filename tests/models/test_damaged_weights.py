@@ -6,12 +6,11 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
+from benchmarks.samples import solved
 from dpl.config import ConfigError
 from dpl.config.run_folder import usable
-from dpl.fem import solve
 from dpl.inference import Simulator
 from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
-from dpl.scene import Sample
 from dpl.training import MSE, Surrogate
 
 MODELS = {
@@ -25,16 +24,11 @@ MODELS = {
 E = 4500.0  # Young's modulus of the scene [Pa]
 
 
-def samples_of(scene, count, seed):
-    drawn = scene.loads.sample(seed, range(count))
-    states = [solve(scene.solver, one).displacement for one in drawn.unbatch()]
-    return Sample(drawn.force, torch.cat(states), drawn.young, drawn.parameters)
-
-
 @pytest.fixture(scope="module")
 def sets(scene):
     """Training, held-out and test samples of the tiny scene."""
-    return [samples_of(scene, count, seed) for seed, count in enumerate((24, 8, 2))]
+    loads = (scene.loads.sample(k, range(count)) for k, count in enumerate((24, 8, 2)))
+    return [solved(scene, load) for load in loads]
 
 
 @pytest.fixture(scope="module", params=MODELS)

@@ -1,13 +1,13 @@
 """Linear solutions of all loads and parameters: compiled, as tensors, and their derivatives."""
 
 from functools import partial
-from itertools import cycle
 
 import pytest
 import torch
 from linear_solutions import BEAM, SUPPORTS, at_free, exact, relative
 
-from dpl import Sample, Scene, fem
+from benchmarks.samples import solved
+from dpl import Scene, fem
 from dpl.fem import NeoHookeanLn
 from dpl.models import FCNN, LinearBase, Unrolled, linear_response
 from dpl.models.linear_response import LinearResponse
@@ -47,28 +47,27 @@ LAWS = {  # law, regions and number of terms
     ),
     "four parts": ({name: NeoHookeanLn(0.3, [1.0, 9.0]) for name in SLICES}, SLICES, 4),
 }
+SMALL = {"rank": 20, "cells": 8, "stages": 1}
 PLAIN, RANGE, THREE = "no range", "Poisson's ratio", "a core and Poisson's ratio"
-PAIRS = [(name, "held") for name in LAWS]
-PAIRS += zip(cycle((PLAIN, RANGE, THREE)), (one for one in SUPPORTS if one != "held"), strict=False)
-RANGES = [*zip(cycle((RANGE, THREE)), SUPPORTS, strict=False), (THREE, "held")]
+HARD = "negative ratios", "nearly incompressible", "a stiff core", "fibres in an isotropic matrix"
+PAIRS = [(PLAIN, "moved"), (RANGE, "on a foundation"), *((name, "held") for name in (*HARD, THREE))]
+RANGES = [(RANGE, "on a foundation"), (THREE, "moved")]
 
 
-def scene_of(name=THREE, supports="held", **options):
-    law, regions, _ = LAWS[name]
+def scene_on(law, regions=None, supports="held", **options):
     supports = SUPPORTS[supports]
     body = fem.Problem.build(BEAM, law, regions=regions or {}, supports=supports, **options)
     newton = fem.Newton(body)
     return Scene(body, fem.ModalLoads(newton.linear_solver, n_modes=3, deflection=0.1), newton)
 
 
+def scene_of(name=THREE, supports="held", **options):
+    return scene_on(*LAWS[name][:2], supports, **options)
+
+
 @pytest.fixture(scope="module", params=PAIRS, ids=", ".join)
 def scene(request):
     return scene_of(*request.param)
-
-
-@pytest.fixture(scope="module")
-def three():
-    return scene_of()
 
 
 def response_of(scene):
@@ -164,9 +163,7 @@ def test_a_zero_force_has_a_zero_solution_and_a_gradient(name):
     assert gradient.any()
 
 
-@pytest.mark.parametrize(
-    ("name", "supports"), [(PLAIN, "moved"), (THREE, "held"), (THREE, "moved")]
-)
+@pytest.mark.parametrize(("name", "supports"), [(PLAIN, "moved"), (THREE, "held")])
 def test_gradients_with_respect_to_forces_are_solutions(name, supports):
     """K(0)^-1 is symmetric: the gradient of g u with respect to f is the solution of g."""
     scene = scene_of(name, supports)
@@ -211,41 +208,25 @@ def test_images_of_a_load_have_the_images_of_its_solution():
         assert relative(image, at_free(scene, symmetry.image(field))) < 1e-5
 
 
-def fitted(scene, count=20):
-    load = scene.loads.sample(0, range(count))
-    states = fem.solve(scene.solver, load).displacement
-    samples = Sample(load.force, states, load.young, load.parameters)
-    net = Unrolled(scene, rank=20, cells=8, stages=1)
-    net.fit(samples, samples)
-    return net
-
-
-@pytest.mark.parametrize(("name", "supports"), [(PLAIN, "held"), *RANGES])
-def test_compiled_predictions_equal_the_tensor_operations(name, supports):
+@pytest.mark.parametrize(
+    ("name", "supports"), [(PLAIN, "moved"), (RANGE, "on a foundation"), (THREE, "held")]
+)
+def test_compiled_predictions_equal_tensors_and_are_linear_for_small_loads(name, supports):
     scene = scene_of(name, supports)
-    net, force, own = fitted(scene), 0.01 * forces(scene), parameters(scene)
+    samples = solved(scene, scene.loads.sample(0, range(20)))
+    net, force, own = Unrolled(scene, **SMALL), 0.01 * forces(scene), parameters(scene)
+    net.fit(samples, samples)
     assert net._is_compiled(force, own)
     compiled = net(force, own)
     tensors = net(force.clone().requires_grad_(), own).detach()
     assert relative(compiled.flatten(1), tensors.flatten(1)) < 1e-5
+    if supports == "held":  # a moved support bends the body without a force
+        small = 1e-7 * force
+        assert relative(net(small, own).flatten(1), exact(scene, small, own).flatten(1)) < 1e-4
 
 
-@pytest.mark.parametrize("name", [PLAIN, THREE])
-def test_a_small_load_has_the_linear_solution(name):
-    scene = scene_of(name)
-    net, force, own = fitted(scene), 1e-9 * forces(scene), parameters(scene)
-    assert relative(net(force, own).flatten(1), exact(scene, force, own).flatten(1)) < 1e-4
-
-
-def test_predictions_are_better_than_the_linear_solution(three):
-    net, load = fitted(three, 40), three.loads.sample(1, range(8))
-    truth = fem.solve(three.solver, load).displacement.flatten(1)
-    linear = next(iter(three.linear.iterate(load))).displacement.flatten(1)
-    found = net(load.force, load.parameters).flatten(1)
-    assert (found - truth).norm(dim=1).median() < 0.5 * (linear - truth).norm(dim=1).median()
-
-
-def test_networks_take_this_linear_solution_as_their_base(three):
+def test_networks_take_this_linear_solution_as_their_base():
+    three = scene_of()
     load = three.loads.sample(0, range(4))
     expected = next(iter(three.linear.iterate(load))).displacement
     assert relative(LinearBase(three).solve(load).flatten(1), expected.flatten(1)) < 1e-4
@@ -261,9 +242,7 @@ def test_networks_take_this_linear_solution_as_their_base(three):
 @pytest.mark.parametrize("other", [NeoHookeanLn(0.3), NeoHookeanLn([0.2, 0.4])])
 def test_stiffnesses_that_differ_too_much_are_refused_before_any_training(other):
     laws = {"core": NeoHookeanLn(0.3, [1.0, 1e9]), "other": other}
-    body = fem.Problem.build(BEAM, laws, regions=REGIONS, supports=SUPPORTS["held"])
-    newton = fem.Newton(body)
-    scene = Scene(body, fem.ModalLoads(newton.linear_solver, n_modes=3, deflection=0.1), newton)
+    scene = scene_on(laws, REGIONS)
     for build in (Unrolled, LinearBase):
         with pytest.raises(ValueError, match=r"core.young.* takes more than 200 steps.*base=null"):
             build(scene)

@@ -1,15 +1,20 @@
-"""Properties of PODNet; those that hold up to rounding errors in double precision."""
+"""Properties of PODNet, and its runs: stored, loaded, evaluated."""
 
+import json
 from functools import partial
 
 import pytest
 import torch
 
 import dpl.fem as fem
+from benchmarks.samples import solved
 from dpl import Sample, Scene
+from dpl.config import build, run_folder
+from dpl.data import Stream
 from dpl.fem.symmetry import NO_SYMMETRIES
 from dpl.models import PODNet
-from dpl.training import MSE, Surrogate
+from dpl.training import MSE, OnLinearSolution, Surrogate
+from dpl.training.checkpoints import read
 
 SMALL = {"width": 16, "blocks": 1}
 WHOLE = {"rank": 1000, "coordinates": 1000, **SMALL}  # no mode is left out
@@ -106,16 +111,6 @@ def test_bases_with_images_of_the_samples_represent_images(scene, batch):
     assert left_over(turned, both) < 1e-4 < 0.1 * left_over(turned, own)
 
 
-def test_bases_are_a_function_of_the_samples(scene, batch):
-    one, same, other = (
-        prepared(scene, samples, seed=seed).net
-        for seed, samples in enumerate([batch, batch, some(batch, 8)])
-    )
-    for name, buffer in one.named_buffers():
-        assert torch.equal(buffer, dict(same.named_buffers())[name]), name
-    assert not torch.equal(one.modes, other.modes)
-
-
 def test_samples_beyond_the_maximum_number_of_snapshots_are_thinned_out(scene, batch, monkeypatch):
     """Every third of twelve samples is used."""
     monkeypatch.setattr("dpl.training.predictors.MAX_SNAPSHOTS", 4)
@@ -165,8 +160,7 @@ def test_a_body_fixed_in_some_directions_only_is_accepted():
     problem = fem.Problem.build(mesh, fem.NeoHookeanLn(0.3), supports=rails)
     solver = fem.Newton(problem, linear="superlu")
     scene = Scene(problem, fem.ModalLoads(solver.linear_solver, n_modes=3, young=4500.0), solver)
-    load = scene.loads.sample((0, 0), range(8))
-    samples = Sample(load.force, fem.solve(solver, load).displacement, load.young)
+    samples = solved(scene, scene.loads.sample((0, 0), range(8)))
     found = answer(prepared(scene, samples, **WHOLE).net, noise(scene))
     assert found.any()
     assert not found[:, ~problem.free].any()
@@ -179,3 +173,78 @@ def test_sizes_are_limited_by_the_degrees_of_freedom_and_need_not_be_equal(scene
     assert PODNet(scene, rank=7, coordinates=60, **SMALL).enter.in_features == 60
     line = f"20 coordinates learnt instead of {int(scene.problem.free.sum())} displacements"
     assert PODNet(scene, rank=20, **SMALL).skipped_work() == [line]
+
+
+# ------------------------------------------------------------------ runs
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    return tmp_path_factory.mktemp("pod")
+
+
+@pytest.fixture
+def overrides(tiny_training):
+    """The command line of a run of four epochs on the tiny scene."""
+
+    def overrides(name, *more):
+        small = ["model=pod", "model.rank=100", "model.blocks=1", "model.coordinates=8"]
+        recipe = ["optimizer=muon", "loss=rmse", "data.symmetry=true", "data.folder=data"]
+        return [*tiny_training, *small, *recipe, "trainer.max_epochs=4", f"run={name}", *more]
+
+    return overrides
+
+
+@pytest.fixture
+def trained(script, overrides, home):
+    """The folder of an uninterrupted run."""
+    if not (home / "whole").exists():
+        ended = script("train", *overrides("whole"), cwd=home)
+        assert ended.status == 0, ended.err
+    return home / "whole"
+
+
+def alike(one, other):
+    """Return True if tensors are equal bit for bit, by name."""
+    return one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
+
+
+def test_a_loaded_run_has_the_same_bases_and_predictions(trained, home, monkeypatch):
+    """Its bases are those of the training samples and their images."""
+    monkeypatch.chdir(home)
+    cfg, module = run_folder.load_run(trained)
+    saved = read(trained / "checkpoints" / "best.safetensors")["state_dict"]
+    assert isinstance(module.net, PODNet)
+    assert module.net.is_fitted
+    assert alike(saved, dict(module.state_dict()))
+    data = build.instantiate(cfg, "data", scene=module.scene)
+    expected = build.build_surrogate(cfg, module.scene)
+    expected.fit_bases(data.samples("train"), fem.symmetries(module.scene.problem))
+    assert alike(dict(expected.net.named_buffers()), dict(module.net.named_buffers()))
+    test = data.samples("test")
+    with torch.no_grad():
+        found = module.predict(test.load)
+        assert torch.equal(found, run_folder.load_run(trained)[1].predict(test.load))
+    rows = json.loads((trained / "evaluation.json").read_text())
+    (network,) = (row for row in rows if row["solver"] == "prediction")
+    error = (found - test.displacement).flatten(1)
+    e_mean = float(error.norm(dim=1).mean()) / error.shape[1]
+    assert network["errors"]["e_mean"] == pytest.approx(e_mean, rel=1e-5)
+
+
+def test_a_stream_fits_the_bases_to_the_validation_loads(script, overrides, home, trained):
+    kept = [o for o in overrides("stream") if "data.train" not in o]
+    more = ["data=online", "data.train.batches=2", "data.train.new_per_round=4"]
+    more.append("model.base=linear")
+    ended = script("train", *kept, *more, "trainer.max_epochs=2", cwd=home)
+    assert ended.status == 0, ended.err
+    cfg, module = run_folder.load_run(home / "stream")
+    data = build.instantiate(cfg, "data", scene=module.scene)
+    assert isinstance(data.source, Stream)
+    assert isinstance(module.predictor, OnLinearSolution)
+    expected = build.build_surrogate(cfg, module.scene)
+    expected.fit_bases(data.samples("val"), fem.symmetries(module.scene.problem))
+    assert alike(dict(expected.net.named_buffers()), dict(module.net.named_buffers()))
+    weights = [dict(one.net.named_parameters()) for one in (expected, module)]
+    assert not alike(*weights), "it has learnt"
+    assert json.loads((home / "stream" / "evaluation.json").read_text())

@@ -6,10 +6,11 @@ import lightning as L
 import pytest
 import torch
 
+from benchmarks.samples import solved
 from dpl import training
 from dpl.config import run_folder
 from dpl.data import DataModule
-from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle, solve
+from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle
 from dpl.fem.parity import Parities
 from dpl.fem.rom.pod import scatter_fields
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness, reduced_terms
@@ -20,12 +21,17 @@ from dpl.models import Unrolled
 from dpl.models.unrolled.correction import choose_newton, fit_errors
 from dpl.models.unrolled.features import rotated_strain, unbalanced_stress
 from dpl.models.unrolled.fit import modes_of_parity
-from dpl.models.unrolled.regression import RIDGES, MapParities, Rows, fit_map
-from dpl.scene import Sample, Scene
+from dpl.models.unrolled.regression import RIDGES, MapParities, fit_map
+from dpl.scene import Scene
 from dpl.training import MSE, Surrogate
-from tests.laws import COMPILED, ISOTROPIC, LAWS
+from tests.laws import ISOTROPIC, LAWS
 
 SMALL = {"rank": 20, "cells": 8, "stages": 2}
+BODIES = {  # mesh, law, linear deflection over L, samples
+    "a beam": (box((4, 1, 1), (5, 3, 3)), NeoHookeanLn(0.3), 0.2, 40),
+    "a range of Poisson's ratios": (box((3, 1, 1), (4, 3, 3)), NeoHookeanLn((0.1, 0.4)), 0.2, 60),
+    "a plane body": (rectangle((4, 1), (9, 3)), NeoHookeanLn(0.3), 0.05, 40),
+}
 
 
 def scene_on(mesh, law, deflection=0.2):
@@ -37,9 +43,7 @@ def scene_on(mesh, law, deflection=0.2):
 
 
 def samples_of(scene, count, seed=0):
-    load = scene.loads.sample(seed, range(count))
-    states = [solve(scene.solver, one).displacement for one in load.unbatch()]
-    return Sample(load.force, torch.cat(states), load.young, load.parameters)
+    return solved(scene, scene.loads.sample(seed, range(count)))
 
 
 def fitted(scene, count=40, **options):
@@ -50,7 +54,7 @@ def fitted(scene, count=40, **options):
 
 @pytest.fixture(scope="module")
 def beam():
-    return scene_on(box((4, 1, 1), (5, 3, 3)), NeoHookeanLn(0.3))
+    return scene_on(*BODIES["a beam"][:3])
 
 
 @pytest.fixture(scope="module")
@@ -60,32 +64,33 @@ def net(beam):
 
 def errors(net, samples):
     """Return relative errors (S,)."""
-    own = (samples.parameters,) if net.extra_inputs else ()
-    difference = net(samples.force, *own) - samples.displacement
+    difference = net(samples.force, samples.parameters) - samples.displacement
     return difference.flatten(1).norm(dim=1) / samples.displacement.flatten(1).norm(dim=1)
 
 
-def linear_errors(scene, samples):
-    pairs = zip(samples.force, samples.displacement, strict=True)
-    return torch.stack([(scene.linear.reference.solve(f) - u).norm() / u.norm() for f, u in pairs])
+@pytest.mark.parametrize("name", BODIES)
+def test_it_is_much_nearer_than_the_linear_solution(name):
+    *body, count = BODIES[name]
+    scene = scene_on(*body)
+    net, unseen = fitted(scene, count), samples_of(scene, 12, seed=2)
+    pairs = zip(unseen.force, unseen.displacement, strict=True)
+    solve_linear = scene.linear.reference.solve
+    linear = torch.stack([(solve_linear(f) - u).norm() / u.norm() for f, u in pairs])
+    assert errors(net, unseen).median() < 0.2 * linear.median()
+    if scene.loads.parameter_ranges:
+        with pytest.raises(ValueError, match="parameters are an input"):
+            net(unseen.force)
+    else:
+        assert errors(net, unseen).max() < 0.3 * linear.max()
 
 
-def test_it_is_much_nearer_than_the_linear_solution(beam, net):
-    unseen = samples_of(beam, 12, seed=2)
-    assert errors(net, unseen).median() < 0.2 * linear_errors(beam, unseen).median()
-    assert errors(net, unseen).max() < 0.3 * linear_errors(beam, unseen).max()
-
-
-@pytest.mark.parametrize("size", [1e-2, 1e-5, 1e-9])
+@pytest.mark.parametrize("size", [1e-2, 1e-9])
 def test_small_loads_have_the_linear_solution(beam, net, size):
     force = size * beam.loads.sample(3, range(4)).force
     exact = torch.stack([beam.linear.solve(one) for one in force])
     error = (net(force) - exact).flatten(1).norm(dim=1) / exact.flatten(1).norm(dim=1)
     assert error.max() < 2 * size + 1e-6  # the factor is float32
-
-
-def test_no_load_no_displacement(beam, net):
-    assert not net(torch.zeros(1, *beam.problem.shape).double()).any()
+    assert not net(0 * force).any()
 
 
 def test_images_of_loads_have_images_of_answers(beam, net):
@@ -109,20 +114,21 @@ def test_a_batch_on_two_threads_is_predicted_like_its_members(law):
     scene = scene_on(box((3, 1, 1), (4, 3, 3)), law)
     net = fitted(scene, 20, rank=8, cells=4, stages=1)
     load = scene.loads.sample(5, range(6))
-    own = load.parameters if net.extra_inputs else load.parameters.new_zeros(6, 0)
     load.force[::2, :-1] = 0.0
-    single = torch.cat([net(*pair) for pair in zip(load.force.split(1), own.split(1), strict=True)])
+    pairs = zip(load.force.split(1), load.parameters.split(1), strict=True)
+    single = torch.cat([net(*pair) for pair in pairs])
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        batch = net(load.force, own)
+        batch = net(load.force, load.parameters)
     finally:
         torch.set_num_threads(before)
     assert torch.allclose(batch, single, rtol=1e-10, atol=1e-12 * float(single.abs().max()))
 
 
-@pytest.mark.parametrize("name", COMPILED)
-def test_every_compiled_law_agrees(name):
+@pytest.mark.parametrize("name", ["linear_elastic", "mooney_rivlin_k2"])
+def test_compiled_laws_of_small_strains_and_of_two_invariants_agree(name):
+    """The stress of each law is compared in tests of `dpl.fem`; a compilation takes 80 MB."""
     scene = scene_on(box((2, 1, 1), (3, 2, 2)), LAWS[name])
     net = fitted(scene, 12, rank=8, cells=4, stages=1)
     load = scene.loads.sample(5, range(2)).force
@@ -140,21 +146,6 @@ def test_gradients_with_respect_to_forces(beam, net):
     assert float((gradient * direction).sum()) == pytest.approx(
         float(ends[0] - ends[1]) / (2 * step), rel=1e-3
     )
-
-
-def test_a_range_of_poissons_ratios():
-    scene = scene_on(box((3, 1, 1), (4, 3, 3)), NeoHookeanLn((0.1, 0.4)))
-    net = fitted(scene, 60)
-    unseen = samples_of(scene, 10, seed=2)
-    assert errors(net, unseen).median() < 0.2 * linear_errors(scene, unseen).median()
-    with pytest.raises(ValueError, match="parameters are an input"):
-        net(unseen.force)
-
-
-def test_a_plane_body():
-    scene = scene_on(rectangle((4, 1), (9, 3)), NeoHookeanLn(0.3), deflection=0.05)
-    net, unseen = fitted(scene), samples_of(scene, 8, seed=2)
-    assert errors(net, unseen).median() < 0.2 * linear_errors(scene, unseen).median()
 
 
 def test_loads_far_out_of_range_stay_finite(beam, net):
@@ -181,12 +172,6 @@ def test_the_surrogate_predicts_in_si_units(beam, net):
 
 def test_fewer_maps_where_they_do_not_help(beam):
     assert len(fitted(beam, 6, stages=30).maps) < 30
-
-
-@pytest.mark.parametrize("wrong", [{"rank": 0}, {"cells": 0}, {"stages": -1}])
-def test_numbers_out_of_range_are_refused(beam, wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        Unrolled(beam, **wrong)
 
 
 def test_a_run_is_trained_and_loaded_and_neither_resumed_nor_fitted_to_a_stream(
@@ -249,15 +234,7 @@ def test_reduced_stiffness_is_that_of_any_law_of_a_range(beam):
         assert (reduced.solve(factors, right) - expected).norm() < 1e-10 * expected.norm()
 
 
-def no_symmetry():
-    """Return the parities of the identity at two cells and for four coordinates."""
-    return MapParities(
-        Parities.of(SymmetryGroup(), 3), torch.arange(2)[None], torch.zeros(4, dtype=torch.int64)
-    )
-
-
-@pytest.mark.parametrize("images", [1, 2])
-@pytest.mark.parametrize("count", [12, 18, 40], ids=["fewer rows", "as many", "more"])
+@pytest.mark.parametrize(("count", "images"), [(12, 1), (18, 2), (40, 1), (40, 2)])
 def test_a_map_is_the_prior_and_a_ridge_regression_and_knows_its_errors_on_unseen_rows(
     count, images
 ):
@@ -267,7 +244,9 @@ def test_a_map_is_the_prior_and_a_ridge_regression_and_knows_its_errors_on_unsee
     features[:, 1, 0, 2, 2] *= 1e-12
     targets, weights = torch.randn(count, 4, generator=random).double(), torch.rand(count).double()
     prior = torch.randn(18, 4, generator=random).double()
-    found, left_out = fit_map(Rows(features, targets, weights), no_symmetry(), prior, images)
+    nothing = torch.arange(2)[None], torch.zeros(4, dtype=torch.int64)  # the identity alone
+    symmetry = MapParities(Parities.of(SymmetryGroup(), 3), *nothing)
+    found, left_out = fit_map(features, targets, weights, symmetry, prior, images)
     X, Y = weights[:, None] * features.flatten(1), weights[:, None] * targets
     scale = X.norm(dim=0)
     scale[-1] = torch.inf
@@ -300,7 +279,7 @@ def test_fields_of_definite_parity(beam, net):
 def test_modes_are_the_best_of_all_images(beam, net):
     free, random = beam.problem.free, torch.Generator().manual_seed(0)
     snapshots = torch.randn(5, int(free.sum()), generator=random).double()
-    modes, _ = modes_of_parity(snapshots, net.group, free, 12)
+    modes, _ = modes_of_parity(net.linear, snapshots, 12)
     assert modes.T @ modes == pytest.approx(torch.eye(12), abs=1e-6)
     fields = scatter_fields(snapshots, free)
     images = torch.cat([symmetry.image(fields)[:, free] for symmetry in net.group])

@@ -12,9 +12,9 @@ from dpl.fem.assembly.kernels import constants_of
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-from dpl.fem.parity import Parities, SignedOrbits
+from dpl.fem.parity import SignedOrbits
 from dpl.models.linear_response import LinearResponse
-from dpl.models.unrolled.loops import SOURCES, BasisArrays, MapArrays, ModelArrays
+from dpl.models.unrolled.loops import SOURCES, ModelArrays
 
 LawArguments = tuple[Law, NDArray[np.float64], int, float]
 
@@ -50,47 +50,33 @@ def model_arrays(
     parities, fields, _ = linear.form
     images = images[parities.members]
     one, two = (SignedOrbits.of_tensors(parities, images, k, SIMD_WIDTH) for k in (1, 2))
-    of_modes = _ByParity(parities, fitted["parity"])
-    gradients, maps = fitted["gradients"], fitted["maps"]
+    parity, gradients, maps = fitted["parity"], fitted["gradients"], fitted["maps"]
+    own = [(parity == p).nonzero()[:, 0] for p in range(len(parities.members))]
+    most = max(map(len, own))
+
+    def by_parity(orbits: SignedOrbits, matrix: Tensor) -> Tensor:
+        """Return the columns of a matrix (n, R) at one value of each orbit, (M, r, m)."""
+        parts = (orbits.of_parity(matrix, columns).mT for columns in own)
+        return torch.stack([pad(part, (0, 0, 0, most - len(part))) for part in parts])
+
     flat = gradients.flatten(1).T  # (C D D, R + 1)
-    none = torch.zeros(0, len(parities.members), of_modes.most, two.images.shape[1])
-    others = torch.stack([of_modes.rows(two, matrix) for matrix in maps]) if len(maps) else none
+    none = torch.zeros(0, len(own), most, two.images.shape[1])
+    columns = [pad(part, (0, most - len(part)), value=len(parity)) for part in own]
     arrays = ModelArrays(
         orbits=linear.orbits,
-        basis=of_modes.basis(fields, fitted["modes"]),
-        maps=MapArrays(
-            gradients=_single(of_modes.rows(one, flat[:, :-1])),
-            rest=_double(torch.where(one.weight > 0, flat[one.images, -1], 0.0)),
-            entry_signs=_double(one.sign),
-            first_signs=_double(one.sign * one.weight),
-            map_signs=_double(two.sign * two.weight),
-            first=_single(of_modes.rows(one, fitted["first_map"])),
-            others=_single(others),
-            limits=_double(fitted["limits"]),
-        ),
+        columns=torch.stack(columns).cpu().numpy(),
+        modes=_single(by_parity(fields, fitted["modes"])),
+        gradients=_single(by_parity(one, flat[:, :-1])),
+        rest=_double(torch.where(one.weight > 0, flat[one.images, -1], 0.0)),
+        entry_signs=_double(one.sign),
+        first_signs=_double(one.sign * one.weight),
+        map_signs=_double(two.sign * two.weight),
+        first_map=_single(by_parity(one, fitted["first_map"])),
+        maps=_single(torch.stack([by_parity(two, B) for B in maps]) if len(maps) else none),
+        limits=_double(fitted["limits"]),
     )
     blocks = one.images.unflatten(1, (-1, 9, SIMD_WIDTH))
     return arrays, blocks[:, :, 0].flatten() // gradients[0, 0].numel()
-
-
-class _ByParity:
-    """Columns of matrices, grouped by their parity."""
-
-    def __init__(self, parities: Parities, parity: Tensor) -> None:
-        """Take the parities of the columns, (R,)."""
-        self._own = [(parity == p).nonzero()[:, 0] for p in range(len(parities.members))]
-        self._count = len(parity)
-        self.most = max(len(columns) for columns in self._own)
-
-    def rows(self, orbits: SignedOrbits, matrix: Tensor) -> Tensor:
-        """Return the columns of a matrix (n, R) at one value of each orbit, (M, r, m)."""
-        parts = [orbits.of_parity(matrix, columns) for columns in self._own]
-        return torch.stack([pad(part, (0, self.most - part.shape[1])).mT for part in parts])
-
-    def basis(self, orbits: SignedOrbits, modes: Tensor) -> BasisArrays:
-        """Return modes (n, R) by parity."""
-        columns = [pad(c, (0, self.most - len(c)), value=self._count) for c in self._own]
-        return BasisArrays(torch.stack(columns).cpu().numpy(), _single(self.rows(orbits, modes)))
 
 
 def _double(tensor: Tensor) -> NDArray[np.float64]:

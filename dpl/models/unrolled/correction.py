@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, Problem, SubspaceNewton
+from dpl.fem import Problem, SubspaceNewton
 from dpl.scene import Sample
 
 RANKS = (60, 160)  # numbers of modes that are tried, and all modes
@@ -64,8 +64,7 @@ def choose_newton(
         problem: The body.
         modes: V, orthonormal, the most important mode first, (N, D, R).
         states: Equilibria at which cells are chosen, (S, N, D).
-        held_out: Samples by whose errors the number is chosen; `LOADS` of them are enough.
-        guesses: Their predictions, (S, N, D).
+        held_out, guesses: `LOADS` samples by whose errors the number is chosen, and predictions.
     """
     random = torch.randperm(len(problem.cells), generator=torch.Generator().manual_seed(0))
     candidates = random[:CANDIDATES].sort().values
@@ -77,7 +76,7 @@ def choose_newton(
         solver = SubspaceNewton.within(
             problem, modes[..., :rank], some, tolerance=TOLERANCE, candidates=candidates
         )
-        errors = relative_errors(held_out, _after(solver, held_out, guesses))
+        errors = relative_errors(held_out, _corrected(solver, held_out, guesses))
         if best is None or errors.max() < best[1].max():
             best = solver, errors
         if errors.max() < SUFFICIENT:
@@ -86,16 +85,13 @@ def choose_newton(
     return best
 
 
-def _after(solver: SubspaceNewton, samples: Sample, guesses: Tensor) -> Tensor:
-    """Return displacements (S, N, D) after the steps, from guesses (S, N, D)."""
-    pairs = zip(samples.load.unbatch(), guesses, strict=True)
-    return torch.stack([_last(solver, load, guess) for load, guess in pairs])
-
-
-def _last(solver: SubspaceNewton, load: Load, guess: Tensor) -> Tensor:
-    states = solver.states(load, guess=guess[None], max_iter=MAX_STEPS, error_tol=ERROR)
-    *_, last = states
-    return last.displacement[0]
+def _corrected(solver: SubspaceNewton, samples: Sample, guesses: Tensor) -> Tensor:
+    """Return displacements (S, N, D) after at most `MAX_STEPS` steps from guesses (S, N, D)."""
+    found = []
+    for load, guess in zip(samples.load.unbatch(), guesses.split(1), strict=True):
+        *_, last = solver.states(load, guess=guess, max_iter=MAX_STEPS, error_tol=ERROR)
+        found.append(last.displacement)
+    return torch.cat(found)
 
 
 def relative_errors(samples: Sample, displacement: Tensor) -> Tensor:

@@ -41,34 +41,21 @@ class SampleCells(NamedTuple):
         return rotated_strain(linear)[:, :, None, :D, :D]
 
     def features(self, law: Material, coordinates: Tensor, linear: Tensor) -> Tensor:
-        """Return `unbalanced_stress`, (B, C, 2, D, D).
-
-        Args:
-            law: The law, see `Material.with_parameters`.
-            coordinates: c, (B, R).
-            linear: H of the linear solution, (B, C, 3, 3).
-        """
+        """Return `unbalanced_stress` (B, C, 2, D, D) of c (B, R) and the linear H (B, C, 3, 3)."""
         D = self.gradients.shape[-1]
         H = self.gradient(coordinates)
         return unbalanced_stress(law, H[:, :, None], linear[:, :, None])[:, :, 0, :, :D, :D]
 
 
-def cell_gradients(problem: Problem, fields: Tensor, cells: Tensor | None = None) -> Tensor:
-    """Return the mean displacement gradients in cells, (R, C, D, D), of fields (R, N, D).
-
-    Args:
-        problem: The body.
-        fields: Displacements.
-        cells: Numbers of the cells, (C,); None: all.
-    """
+def cell_gradients(problem: Problem, fields: Tensor, cells: Tensor) -> Tensor:
+    """Return mean gradients (R, C, D, D) of displacements (R, N, D) in cells, by number (C,)."""
     share = problem.dV / problem.dV.sum(dim=1, keepdim=True)
     mean = (problem.dN * share[..., None, None]).sum(dim=1).expand(len(problem.cells), -1, -1)
-    nodes = problem.cells if cells is None else problem.cells[cells]
-    return fields[:, nodes].mT @ (mean if cells is None else mean[cells])
+    return fields[:, problem.cells[cells]].mT @ mean[cells]
 
 
 def mechanical_maps(
-    problem: Problem, cells: Tensor, fields: Tensor, inverse: Tensor
+    problem: Problem, cells: Tensor, gradients: Tensor, inverse: Tensor
 ) -> list[Tensor]:
     """Return the maps (C D D, R) and (2 C D D, R) to which the ridge of the fit shrinks.
 
@@ -77,17 +64,16 @@ def mechanical_maps(
     modified Newton iteration: the Galerkin solution under the stress -R^T dP.
 
     Args:
-        problem: The body.
-        cells: Numbers of the sample cells, (C,).
-        fields: Displacement gradients of the modes at them, (R, C, D, D).
+        problem, cells: The body, and numbers of its sample cells, (C,).
+        gradients: Displacement gradients of the modes at them, (R, C, D, D).
         inverse: (V^T K(0) V)^-1, (R, R).
     """
     volumes = problem.dV.sum(dim=1).expand(len(problem.cells))
     shares = volumes[cells] * (volumes.sum() / volumes[cells].sum())
-    dim, law = fields.shape[-1], problem.reference.material.of_cells(cells).centred()
-    whole = pad(fields, (0, 3 - dim, 0, 3 - dim))[:, :, None]
+    dim, law = gradients.shape[-1], problem.reference.material.of_cells(cells).centred()
+    whole = pad(gradients, (0, 3 - dim, 0, 3 - dim))[:, :, None]
     stress = law.rest_stress(whole)[:, :, 0, :dim, :dim]
-    both = torch.stack([-fields, torch.zeros_like(fields)], dim=2)
+    both = torch.stack([-gradients, torch.zeros_like(gradients)], dim=2)
     weighted = (shares[:, None, None] * stress, shares[:, None, None, None] * both)
     return [part.flatten(1).T @ inverse for part in weighted]
 

@@ -6,16 +6,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.fem import Problem
 from dpl.fem.materials.material import Material
-from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.pod import MIN_SKETCH_SIZE, pod, scatter_fields
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness, reduced_terms
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
-from dpl.fem.symmetry import Symmetry, SymmetryGroup
+from dpl.fem.symmetry import Symmetry
 from dpl.models.linear_response import LinearResponse
 from dpl.models.unrolled.features import SampleCells, cell_gradients, mechanical_maps
-from dpl.models.unrolled.regression import MapParities, Rows, fit_map, weighted_error
+from dpl.models.unrolled.regression import MapParities, fit_map, weighted_error
 from dpl.scene import Sample
 
 CHUNK = 256  # samples whose fields or features are computed at a time
@@ -33,15 +31,13 @@ class Maps(NamedTuple):
 
     Attributes:
         cells: The sample cells.
-        first: B_0, (C D D, R).
-        others: B_1, B_2, ..., (2 C D D, R) each.
+        matrices: B_0, (C D D, R), and B_1, B_2, ..., (2 C D D, R) each.
         limits: Largest ratio of each correction to the one before, (1 + K,); that of the first is
             to the linear solution.
     """
 
     cells: SampleCells
-    first: Tensor
-    others: Sequence[Tensor]
+    matrices: Sequence[Tensor]
     limits: Tensor
 
     def __call__(self, law: Material, linear: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,11 +49,12 @@ class Maps(NamedTuple):
             law: The law, see `Material.with_parameters`.
             linear: Coordinates of Galerkin linear solutions, (B, R).
         """
+        first, *others = self.matrices
         H = self.cells.gradient(linear)
-        step = self.cells.first_features(H).flatten(1) @ self.first
+        step = self.cells.first_features(H).flatten(1) @ first
         c = step = limit_step(step, linear, self.limits[0])
         steps = [linear, step]
-        for matrix, limit in zip(self.others, self.limits[1:], strict=True):
+        for matrix, limit in zip(others, self.limits[1:], strict=True):
             proposed = self.cells.features(law, linear + c, H).flatten(1) @ matrix
             step = limit_step(proposed, step, limit)
             c = c + step
@@ -97,14 +94,9 @@ def sample_weights(displacement: Tensor) -> Tensor:
 def in_coordinates(
     terms: StiffnessTerms, modes: Tensor, stiffness: ReducedStiffness, samples: Sample, rest: Tensor
 ) -> Columns:
-    """Return samples in coordinates of the modes.
+    """Return samples in coordinates of modes V (n, R), in which K(0) is `stiffness`.
 
-    Args:
-        terms: Terms of K(0).
-        modes: V, (n, R).
-        stiffness: V^T K(0) V.
-        samples: The samples, (S, N, D).
-        rest: Their displacements minus the linear solutions, (S, n).
+    `rest` are their displacements minus the linear solutions, (S, n).
     """
     parts, problem = [], terms.problem
     for part, own in zip(_chunks(samples), rest.split(CHUNK), strict=True):
@@ -125,22 +117,13 @@ def _image(columns: Tensor, symmetry: Symmetry, free: Tensor) -> Tensor:
     return symmetry.image(scatter_fields(columns, free))[:, free]
 
 
-def modes_of_parity(
-    snapshots: Tensor, group: SymmetryGroup, free: Tensor, rank: int
-) -> tuple[Tensor, Tensor]:
+def modes_of_parity(linear: LinearResponse, snapshots: Tensor, rank: int) -> tuple[Tensor, Tensor]:
     """Return POD modes (n, R) of snapshots (S, n) and their images, and their parities (R,).
 
     Each mode has one parity. The largest mode is the first. They are rounded to float32.
-
-    Args:
-        snapshots: Fields at free degrees of freedom.
-        group: Symmetries of the body.
-        free: Mask of free degrees of freedom, (N, D).
-        rank: Largest number of modes.
     """
-    parities = Parities.of(group, free.shape[1])
-    orbits = SignedOrbits.of_field(parities, group, free)
-    others = group.coset_representatives()
+    (parities, orbits, _), free = linear.form, linear.scene.problem.free
+    others = linear.group.coset_representatives()
     count, size = len(snapshots) * len(others), snapshots.shape[1]
     some = snapshots[:: max(1, -(-4 * count * size // MAX_BYTES))]
     dtype = torch.float32 if len(some) * len(others) > MIN_SKETCH_SIZE else torch.float64
@@ -164,26 +147,11 @@ def modes_of_parity(
 
 
 def _chunks(samples: Sample) -> Iterator[Sample]:
-    for start in range(0, len(samples.force), CHUNK):
-        yield Sample(*(column[start : start + CHUNK] for column in samples))
-
-
-def nonlinear_displacement(problem: Problem, samples: Sample, linear: LinearResponse) -> Tensor:
-    """Return displacements minus linear solutions at free degrees of freedom, (S, n)."""
-    parts = [
-        part.displacement[:, problem.free] - linear(part.force[:, problem.free], part.parameters)
-        for part in _chunks(samples)
-    ]
-    return torch.cat(parts)
+    return map(Sample._make, zip(*(column.split(CHUNK) for column in samples), strict=True))
 
 
 def choose_cells(images: Tensor, count: int) -> Tensor:
-    """Return random cells (C,), C >= count if there are as many, with all their images.
-
-    Args:
-        images: Image of each cell under each symmetry, (G, E).
-        count: Number of cells.
-    """
+    """Return random cells (C,), C >= count if there are as many, with all their images (G, E)."""
     orbit = images.amin(dim=0)  # smallest number of a cell of the orbit
     names = orbit.unique()
     order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
@@ -192,132 +160,95 @@ def choose_cells(images: Tensor, count: int) -> Tensor:
     return torch.isin(orbit, order[:taken]).nonzero()[:, 0]
 
 
-class Regression:
-    """Fit of the maps at given sample cells, one after the other.
+def maps_at_cells(
+    law: Material,
+    cells: SampleCells,
+    symmetry: MapParities,
+    priors: Sequence[Tensor],
+    sets: tuple[Columns, Columns],
+    *,
+    copies: int,
+    stages: int,
+) -> tuple[float, Maps, Tensor]:
+    """Fit maps one after the other, as long as the held-out error decreases enough.
 
     A map that is fitted to few samples predicts them better than others. The next map is therefore
     fitted to states of each sample that follow from maps which are fitted to the other samples.
 
-    Attributes:
-        maps: The maps so far.
-        errors: Weighted held-out errors of the linear solution and after each map.
+    Returns:
+        The weighted held-out error, the maps, and what they miss of the held-out targets, (S, R).
+        The map is zero if none is good enough.
     """
-
-    def __init__(
-        self,
-        law: Material,
-        cells: SampleCells,
-        symmetry: MapParities,
-        priors: Sequence[Tensor],
-        fitted: Columns,
-        held: Columns,
-        images: int,
-    ) -> None:
-        """Start from the linear solution.
-
-        Args:
-            law: The law of the cells, perhaps with ranges.
-            cells: The sample cells.
-            symmetry: Parities of values at the cells and of coordinates.
-            priors: See `mechanical_maps`.
-            fitted, held: Samples to fit to, and to choose by.
-            images: Number of images of each sample in `fitted`, see `fit_map`.
-        """
-        self._images = images
-        self._law, self._cells, self._symmetry, self._priors = law, cells, symmetry, priors
-        self._sets = fitted, held
-        self._present = [torch.zeros_like(part.linear) for part in self._sets]
-        self._steps = [fitted.linear, held.linear]
-        self._matrices: list[Tensor] = []
-        self._limits: list[Tensor] = []
-        self.errors = [weighted_error(held.target, held.weights)]
-
-    @property
-    def maps(self) -> Maps:
-        """The maps so far; without one, a first map of zeros."""
-        count, dim = self._cells.gradients.shape[1:3]
-        none = torch.zeros(count * dim * dim, self._sets[0].linear.shape[1], dtype=torch.float64)
-        first = self._matrices[0] if self._matrices else none
-        limits = torch.stack(self._limits or [torch.tensor(1.0, dtype=torch.float64)])
-        return Maps(self._cells, first, self._matrices[1:], limits)
-
-    def error_with(self, squares: Tensor) -> float:
-        """Return the weighted mean error of held-out samples.
-
-        Args:
-            squares: Squared errors outside the modes, (S,).
-        """
-        held = self._sets[1]
-        inside = (held.target - self._present[1]).square().sum(dim=1)
-        return float(((inside + squares.clamp(min=0)).sqrt() * held.weights).mean())
-
-    def add_map(self) -> bool:
-        """Fit the next map; return False, without adding it, if it gains too little."""
-        rows, held = (self._rows(*pair) for pair in zip(self._sets, self._present, strict=True))
-        prior = self._priors[min(len(self._matrices), 1)]
-        matrix, left_out = fit_map(rows, self._symmetry, prior, self._images)
+    (fitted, held), (count, dim, _) = sets, cells.gradients.shape[1:]
+    matrices, limits = list[Tensor](), list[Tensor]()
+    present, steps = [torch.zeros_like(part.target) for part in sets], [c.linear for c in sets]
+    error = weighted_error(held.target, held.weights)
+    for k in range(1 + stages):
+        pairs = zip(sets, present, strict=True)
+        rows, unseen = (_features(law, cells, part, c if k else None) for part, c in pairs)
+        targets, prior = fitted.target - present[0], priors[min(k, 1)]
+        matrix, left_out = fit_map(rows, targets, fitted.weights, symmetry, prior, copies)
         matrix = matrix.float().double()
-        usual, proposed = (part.features.flatten(1) @ matrix for part in (rows, held))
-        error = weighted_error(held.targets - proposed, held.weights)
-        if not error < MIN_GAIN * self.errors[-1]:
-            return False
-        self._matrices.append(matrix)
-        sizes = self._steps[0].norm(dim=1)
+        usual, proposed = (part.flatten(1) @ matrix for part in (rows, unseen))
+        reached = weighted_error(held.target - present[1] - proposed, held.weights)
+        if not reached < MIN_GAIN * error:
+            break
+        sizes = steps[0].norm(dim=1)
         limit = LIMIT * (usual.norm(dim=1)[sizes > 0] / sizes[sizes > 0]).max()
-        self._limits.append(limit)
-        steps = rows.targets - left_out, proposed
-        self._steps = [
-            limit_step(step, before, limit) for step, before in zip(steps, self._steps, strict=True)
+        both = zip((targets - left_out, proposed), steps, strict=True)
+        steps = [limit_step(step, before, limit) for step, before in both]
+        present = [c + step for c, step in zip(present, steps, strict=True)]
+        matrices.append(matrix)
+        limits.append(limit)
+        error = reached
+    if not matrices:
+        matrices = [torch.zeros(count * dim * dim, fitted.linear.shape[1], dtype=torch.float64)]
+        limits = [torch.tensor(1.0, dtype=torch.float64)]
+    return error, Maps(cells, matrices, torch.stack(limits)), held.target - present[1]
+
+
+def _features(law: Material, cells: SampleCells, samples: Columns, c: Tensor | None) -> Tensor:
+    """Return features (S, C, F, D, D) of the first map, or of the others at coordinates (S, R)."""
+    if c is None:
+        parts = [cells.first_features(cells.gradient(part)) for part in samples.linear.split(CHUNK)]
+        return torch.cat(parts)
+    columns = (column.split(CHUNK) for column in (samples.linear, c, samples.parameters))
+    return torch.cat(
+        [
+            cells.features(law.with_parameters(own), linear + part, cells.gradient(linear))
+            for linear, part, own in zip(*columns, strict=True)
         ]
-        self._present = [c + step for c, step in zip(self._present, self._steps, strict=True)]
-        self.errors.append(error)
-        return True
-
-    def _rows(self, samples: Columns, present: Tensor) -> Rows:
-        parts = zip(samples.linear.split(CHUNK), present.split(CHUNK), strict=True)
-        laws = (self._law.with_parameters(p) for p in samples.parameters.split(CHUNK))
-        features = [self._features(law, *part) for law, part in zip(laws, parts, strict=True)]
-        return Rows(torch.cat(features), samples.target - present, samples.weights)
-
-    def _features(self, law: Material, linear: Tensor, present: Tensor) -> Tensor:
-        H = self._cells.gradient(linear)
-        if not self._matrices:
-            return self._cells.first_features(H)
-        return self._cells.features(law, linear + present, H)
+    )
 
 
 def fit_maps(
-    problem: Problem,
+    linear: LinearResponse,
     modes: Tensor,
     parity: Tensor,
-    group: SymmetryGroup,
     inverse: Tensor,
-    samples: tuple[Columns, Columns],
+    sets: tuple[Columns, Columns],
     *,
     copies: int,
     cells: int,
     stages: int,
-) -> tuple[Tensor, Regression]:
-    """Return sample cells (C,) and maps with the smallest held-out error.
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Return buffers of the maps with the smallest held-out error, and what they miss, (S, R).
 
     Half as many cells are tried as long as that is better.
 
     Args:
-        problem: The body.
-        modes: V, (n, R).
-        parity: Parities of the modes, (R,).
-        group: Symmetries of the body.
+        linear: Linear solutions of the body.
+        modes, parity: V, (n, R), and the parity of each mode, (R,).
         inverse: (V^T K(0) V)^-1, (R, R).
-        samples: Samples to fit to, and to choose by.
-        copies: Number of images of each sample to fit to.
-        cells: Number of sample cells.
-        stages: Largest number of maps after the first.
+        sets: Samples to fit to, and to choose by.
+        copies: Number of images of each sample in the first set, see `fit_map`.
+        cells, stages: Largest numbers of sample cells, and of maps after the first.
     """
-    images = group.cell_images(problem)
-    parities = Parities.of(group, problem.shape[1])
+    problem, parities = linear.scene.problem, linear.form.parities
+    images = linear.group.cell_images(problem)
     fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])
     parity_of_fields = torch.cat([parity, torch.zeros(1, dtype=torch.int64)])
-    best: tuple[Tensor, Regression] | None = None
+    best: tuple[float, Tensor, Maps, Tensor] | None = None
     while cells:
         numbers = choose_cells(images, cells)
         positions = torch.searchsorted(numbers, images[:, numbers])
@@ -328,81 +259,64 @@ def fit_maps(
         sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
         law = problem.material.of_cells(numbers).centred()
         priors = mechanical_maps(problem, numbers, sample_cells.gradients[:-1], inverse)
-        regression = Regression(law, sample_cells, symmetry, priors, *samples, copies)
-        while len(regression.errors) <= 1 + stages and regression.add_map():
-            pass
-        if best is not None and regression.errors[-1] >= best[1].errors[-1]:
+        options = {"copies": copies, "stages": stages}
+        error, maps, missed = maps_at_cells(law, sample_cells, symmetry, priors, sets, **options)
+        if best is not None and error >= best[0]:
             break
-        best, cells = (numbers, regression), cells // 2
+        best, cells = (error, numbers, maps, missed), cells // 2
     assert best is not None
-    return best
+    _, numbers, maps, missed = best
+    first, *others = (one.float() for one in maps.matrices)
+    buffers = {
+        "cells": numbers,
+        "gradients": maps.cells.gradients,
+        "first_map": first,
+        "maps": torch.stack(others) if others else first.new_zeros(0, 2 * len(first), len(parity)),
+        "limits": maps.limits,
+    }
+    return buffers, missed
 
 
 def fit_in_best_modes(
-    problem: Problem,
-    group: SymmetryGroup,
-    linear: LinearResponse,
-    both: tuple[Sample, Sample],
-    *,
-    rank: int,
-    cells: int,
-    stages: int,
+    linear: LinearResponse, both: tuple[Sample, Sample], *, rank: int, cells: int, stages: int
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Fit the maps in all modes, in half and in a quarter of them.
 
-    Args:
-        problem: The body.
-        group: Symmetries of the body.
-        linear: Linear solutions.
-        both: Samples to fit to, and to choose by.
-        rank: Largest number of modes.
-        cells: Largest number of sample cells.
-        stages: Largest number of maps after the first.
+    The samples are those to fit to, and those to choose by. `rank`, `cells` and `stages` are the
+    largest numbers of modes, of sample cells, and of maps after the first.
 
     Returns:
         The buffers of `dpl.models.Unrolled`, by name, of the fit with the smallest weighted mean
         error of held-out samples; and all modes, (n, R).
     """
-    rests = [nonlinear_displacement(problem, part, linear) for part in both]
-    weights = sample_weights(both[0].displacement[:, problem.free])
-    every, parity = modes_of_parity(weights[:, None] * rests[0], group, problem.free, rank)
-    inverses = [symmetry.inverse for symmetry in group.coset_representatives()]
+    problem, terms = linear.scene.problem, linear.terms
+    free = problem.free
+    rests = [
+        torch.cat([u[:, free] - linear(f[:, free], own) for f, u, _, own in _chunks(part)])
+        for part in both
+    ]
+    weights = sample_weights(both[0].displacement[:, free])
+    every, parity = modes_of_parity(linear, weights[:, None] * rests[0], rank)
+    inverses = [symmetry.inverse for symmetry in linear.group.coset_representatives()]
     few = inverses[: max(1, MAX_ROWS // len(rests[0]))]
-    turned = [_image(every.T, one, problem.free).T for one in few]
+    turned = [_image(every.T, one, free).T for one in few]
     fits: list[tuple[float, dict[str, Tensor]]] = []
-    factors, count = linear.terms.factors(problem.reference.material), every.shape[1]
+    factors, count = terms.factors(problem.reference.material), every.shape[1]
     while count:
         modes = every[:, :count]
-        stiffness = ReducedStiffness(reduced_terms(linear.terms, modes), linear.terms)
-        inverse = torch.from_numpy(stiffness.inverse(factors)[0])
+        stiffness = ReducedStiffness(reduced_terms(terms, modes), terms)
         # coordinates of images of the samples are those of the samples in images of the modes
-        fitted = _joined(
-            in_coordinates(linear.terms, images[:, :count], stiffness, both[0], rests[0])
-            for images in turned
-        )
-        held = in_coordinates(linear.terms, modes, stiffness, both[1], rests[1])
-        sets = fitted, held
+        copies = (one[:, :count] for one in turned)
+        fitted = _joined(in_coordinates(terms, V, stiffness, both[0], rests[0]) for V in copies)
+        held = in_coordinates(terms, modes, stiffness, both[1], rests[1])
+        inverse = torch.from_numpy(stiffness.inverse(factors)[0])
         options = {"copies": len(turned), "cells": cells, "stages": stages}
-        numbers, found = fit_maps(problem, modes, parity[:count], group, inverse, sets, **options)
-        squares = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)  # not in V
-        buffers = _buffers(modes, parity[:count], stiffness, numbers, found.maps)
-        fits.append((found.error_with(squares), buffers))
+        sets = fitted, held
+        found, missed = fit_maps(linear, modes, parity[:count], inverse, sets, **options)
+        outside = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)
+        square = missed.square().sum(dim=1) + outside.clamp(min=0)
+        error = float((square.sqrt() * held.weights).mean())
+        own = {"modes": modes.float(), "parity": parity[:count], "stiffness": stiffness.parts}
+        fits.append((error, own | found))
         count = count // 2 if count // 2 >= MIN_RANK else 0
     return min(fits, key=lambda pair: pair[0])[1], every
-
-
-def _buffers(
-    modes: Tensor, parity: Tensor, stiffness: ReducedStiffness, cells: Tensor, maps: Maps
-) -> dict[str, Tensor]:
-    first = maps.first.float()
-    none = torch.zeros(0, 2 * len(first), modes.shape[1])
-    return {
-        "modes": modes.float(),
-        "parity": parity,
-        "stiffness": stiffness.parts,
-        "cells": cells,
-        "gradients": maps.cells.gradients,
-        "first_map": first,
-        "maps": torch.stack([one.float() for one in maps.others]) if maps.others else none,
-        "limits": maps.limits,
-    }

@@ -39,57 +39,37 @@ def limit_step(step, most):
     return size
 
 
-class BasisArrays(NamedTuple):
-    """R modes by parity; r is the largest number of modes of a parity.
+class ModelArrays(NamedTuple):
+    """Arrays of an unrolled reduced solver with R modes, by parity.
+
+    r: largest number of modes of a parity. b: orbits of entries of tensors at the sample cells, in
+    blocks of 9 rows, and twice as many in blocks of 18.
 
     Attributes:
+        orbits: Degrees of freedom.
         columns: Positions of the coordinates of each parity, (M, r); R where there are fewer.
         modes: One value of each orbit, (M, r, m).
-    """
-
-    columns: NDArray[np.int64]
-    modes: NDArray[np.float32]
-
-
-class MapArrays(NamedTuple):
-    """Maps of the iterations at the sample cells, by parity.
-
-    b: orbits of entries of tensors at the sample cells, in blocks of 9 rows, and twice as many in
-    blocks of 18.
-
-    Attributes:
         gradients: G, (M, r, b).
         rest: Gradients of the prescribed displacement, (M, b).
         entry_signs: Factors of the images of entries of G, (M, b).
         first_signs: The same times weights of the orbits, (M, b).
         map_signs: The same for two tensors, (M, 2 b).
-        first: B_0^T, (M, r, b).
-        others: B_1^T, ..., (K, M, r, 2 b).
+        first_map: B_0^T, (M, r, b).
+        maps: B_1^T, ..., (K, M, r, 2 b).
         limits: Largest ratio of each correction to the one before, (1 + K,).
     """
 
+    orbits: OrbitArrays
+    columns: NDArray[np.int64]
+    modes: NDArray[np.float32]
     gradients: NDArray[np.float32]
     rest: NDArray[np.float64]
     entry_signs: NDArray[np.float64]
     first_signs: NDArray[np.float64]
     map_signs: NDArray[np.float64]
-    first: NDArray[np.float32]
-    others: NDArray[np.float32]
+    first_map: NDArray[np.float32]
+    maps: NDArray[np.float32]
     limits: NDArray[np.float64]
-
-
-class ModelArrays(NamedTuple):
-    """Arrays of an unrolled reduced solver.
-
-    Attributes:
-        orbits: Degrees of freedom.
-        basis: Modes of the nonlinear displacement.
-        maps: Maps of the iterations.
-    """
-
-    orbits: OrbitArrays
-    basis: BasisArrays
-    maps: MapArrays
 
 
 @njit(fastmath=True)
@@ -113,60 +93,6 @@ def join(characters, signs, parts, out):
                 out[g, j] += factor * signs[g, j] * parts[p, j]
 
 
-@njit
-def of_parity(columns, coordinates, out):
-    """Set `out` (r,) to the coordinates of one parity, zero where there are fewer."""
-    for k in range(len(columns)):
-        out[k] = coordinates[columns[k]] if columns[k] < len(coordinates) else 0.0
-
-
-@njit
-def set_gradients(model, coordinates, own, parts, H):
-    """Set H (M, b) at all images of the sample cells; `own` (r,) and `parts` (M, b) are work."""
-    parts[:] = 0.0
-    for p in range(len(parts)):
-        of_parity(model.basis.columns[p], coordinates, own)
-        add_product(own, model.maps.gradients[p], parts[p])
-    H[:] = model.maps.rest
-    join(model.orbits.characters, model.maps.entry_signs, parts, H)
-
-
-@njit
-def set_step(model, signs, matrices, features, parts, own, step):
-    """Set step (R,) to the product of features (M, b) with matrices (M, r, b)."""
-    split(model.orbits.characters, signs, features, parts)
-    for p in range(len(parts)):
-        own[:] = 0.0
-        subtract_product(matrices[p], parts[p], own)
-        for k in range(len(own)):
-            if model.basis.columns[p, k] < len(step):
-                step[model.basis.columns[p, k]] = -own[k]
-
-
-@njit
-def galerkin(basis, inverse, parts):
-    """Return the coordinates (R,) of the Galerkin linear solution of a force by parity (M, m)."""
-    right = np.zeros(len(inverse))
-    for p in range(len(parts)):
-        own = np.zeros(basis.columns.shape[1], parts.dtype)
-        subtract_product(basis.modes[p], parts[p], own)
-        for k in range(len(own)):
-            if basis.columns[p, k] < len(right):
-                right[basis.columns[p, k]] = -own[k]
-    found = np.zeros(len(inverse))
-    add_product(right, inverse, found)  # no BLAS, whose threads wait for each other
-    return found
-
-
-@njit
-def add_modes(basis, coordinates, values):
-    """Add V c to values by parity (M, m)."""
-    own = np.zeros(basis.columns.shape[1], values.dtype)
-    for p in range(len(values)):
-        of_parity(basis.columns[p], coordinates, own)
-        add_product(own, basis.modes[p], values[p])
-
-
 @njit(fastmath=True)
 def set_field(orbits, values, unit, field):
     """Set a field (N D,) at free degrees of freedom from values over a unit by parity (M, m)."""
@@ -182,42 +108,71 @@ def set_field(orbits, values, unit, field):
             field[orbits.dofs[g, j]] = orbits.signs[g, j] * own[j]
 
 
+@njit
+def add_fields(columns, coordinates, matrices, values):
+    """Add products of coordinates (R,) and matrices (M, r, b) to values by parity (M, b)."""
+    own = np.zeros(columns.shape[1], values.dtype)
+    for p in range(len(values)):
+        for k in range(len(own)):
+            inside = columns[p, k] < len(coordinates)
+            own[k] = coordinates[columns[p, k]] if inside else 0.0
+        add_product(own, matrices[p], values[p])
+
+
+@njit
+def set_coordinates(columns, matrices, values, coordinates):
+    """Set coordinates (R,) to products of matrices (M, r, b) and values by parity (M, b)."""
+    own = np.zeros(columns.shape[1], values.dtype)
+    for p in range(len(values)):
+        own[:] = 0.0
+        subtract_product(matrices[p], values[p], own)
+        for k in range(len(own)):
+            if columns[p, k] < len(coordinates):
+                coordinates[columns[p, k]] = -own[k]
+
+
+@njit
+def set_gradients(model, coordinates, parts, H):
+    """Set H (M, b) at all images of the sample cells; `parts` (M, b) is work."""
+    parts[:] = 0.0
+    add_fields(model.columns, coordinates, model.gradients, parts)
+    H[:] = model.rest
+    join(model.orbits.characters, model.entry_signs, parts, H)
+
+
 @njit(error_model="numpy")
 def nonlinear_coordinates(law, c, needs, finite, model, linear, sizes):
-    """Return coordinates (R,) of the nonlinear displacement.
+    """Return coordinates (R,) of the nonlinear displacement; the arguments are as in `predict`.
 
-    Args:
-        law, c, needs, finite: The law, see `dpl.models.unrolled.compiled.law_arguments`.
-        model: The arrays of the model.
-        linear: Coordinates of the Galerkin linear solution, (R,).
-        sizes: Norms of these coordinates and of the corrections by the maps, (K + 2,); set.
+    `linear` (R,) are the coordinates of the Galerkin linear solution.
     """
-    M, b = model.maps.rest.shape
+    M, b = model.rest.shape
     shape = M * b // (9 * SIMD_WIDTH), 9, SIMD_WIDTH
-    own = np.zeros(model.basis.columns.shape[1])
     parts, both = np.zeros((M, b)), np.zeros((M, 2 * b))
     HL, H, features = np.zeros((M, b)), np.zeros((M, b)), np.zeros(shape)
     stress, work = np.zeros((M, 2 * b)), np.zeros((100, SIMD_WIDTH))
     blocks = stress.reshape((shape[0], 18, SIMD_WIDTH))
-    set_gradients(model, linear, own, parts, HL)
+    set_gradients(model, linear, parts, HL)
     linear_blocks, present = HL.reshape(shape), H.reshape(shape)
-    constants = rows(c.shape[1])
+    constants, characters = rows(c.shape[1]), model.orbits.characters
     for k in range(shape[0]):
         rotated_strain(linear_blocks[k], features[k])
-    maps, step = model.maps, np.zeros(len(linear))
-    set_step(model, maps.first_signs, maps.first, features.reshape((M, b)), parts, own, step)
+    step = np.zeros(len(linear))
+    split(characters, model.first_signs, features.reshape((M, b)), parts)
+    set_coordinates(model.columns, model.first_map, parts, step)
     sizes[0] = np.sqrt((linear * linear).sum())
-    sizes[1] = limit_step(step, maps.limits[0] * sizes[0])
+    sizes[1] = limit_step(step, model.limits[0] * sizes[0])
     total = step.copy()
-    for i in range(len(maps.others)):
-        set_gradients(model, linear + total, own, parts, H)
+    for i in range(len(model.maps)):
+        set_gradients(model, linear + total, parts, H)
         for k in range(shape[0]):
             gather_constants(c, SIMD_WIDTH * k, SIMD_WIDTH, constants)
             unbalanced_stress(
                 law, constants, needs, finite, present[k], linear_blocks[k], work, blocks[k]
             )
-        set_step(model, maps.map_signs, maps.others[i], stress, both, own, step)
-        sizes[i + 2] = limit_step(step, maps.limits[i + 1] * sizes[i + 1])
+        split(characters, model.map_signs, stress, both)
+        set_coordinates(model.columns, model.maps[i], both, step)
+        sizes[i + 2] = limit_step(step, model.limits[i + 1] * sizes[i + 1])
         total += step
     return total
 
@@ -233,9 +188,12 @@ def predict(law, c, needs, finite, model, inverse, unit, parts, solution, field,
         unit, parts, solution: Force and linear solution by parity, see `LinearResponse.at`; the
             solution is overwritten.
         field: Displacement at free degrees of freedom, (N D,).
-        sizes: Norms of the corrections, see `nonlinear_coordinates`.
+        sizes: Norms of the linear coordinates and of the corrections by the maps, (K + 2,); set.
     """
-    linear = unit * galerkin(model.basis, inverse, parts)
+    right, linear = np.zeros(len(inverse)), np.zeros(len(inverse))
+    set_coordinates(model.columns, model.modes, parts, right)
+    add_product(right, inverse, linear)  # no BLAS, whose threads wait for each other
+    linear *= unit
     found = nonlinear_coordinates(law, c, needs, finite, model, linear, sizes)
-    add_modes(model.basis, found / unit, solution)
+    add_fields(model.columns, found / unit, model.modes, solution)
     set_field(model.orbits, solution, unit, field)

@@ -1,6 +1,5 @@
 """Unrolled reduced solver: a few iterations in a subspace whose linear maps are fitted to data."""
 
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any, cast
 
@@ -15,9 +14,9 @@ from dpl.fem.rom.ecsw import Cubature, refuse_follower_loads
 from dpl.fem.rom.pod import orthonormal_fields
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.symmetry import SymmetryGroup
+from dpl.models.interface import StoredBuffers, check_indices
 from dpl.models.linear_base import SCALE_STREAM
-from dpl.models.linear_response import Array, LinearResponse, Parts
-from dpl.models.stored_buffers import StoredBuffers, check_indices
+from dpl.models.linear_response import Array, LinearResponse, Solve
 from dpl.models.unrolled.compiled import LawArguments, law_arguments, model_arrays
 from dpl.models.unrolled.correction import LOADS, choose_newton, fit_errors, relative_errors
 from dpl.models.unrolled.features import SampleCells
@@ -33,7 +32,6 @@ SMALL = 0.1  # part of held-out samples whose sizes are too small for a fit of t
 MAX_SIZE = 100_000  # of rank, cells and stages
 # buffers and axes with the numbers of modes, cells, maps, and modes and cells of Newton's method
 SIZES = (("modes", 1), ("cells", 0), ("maps", 0), ("newton_modes", 1), ("newton_cells", 0))
-_Solve = Callable[[Array], tuple[float, Parts, Parts]]  # see `LinearResponse.at`
 
 
 class Unrolled(StoredBuffers):
@@ -137,21 +135,18 @@ class Unrolled(StoredBuffers):
         self.scene = scene
         self.rank, self.sample_count, self.stages = rank, cells, stages
         refuse_follower_loads(scene.problem, "model=unrolled")
-        constant = scene.loads.constant_force
+        constant, problem = scene.loads.constant_force, scene.problem
         also = [] if constant is None else [constant]
-        problem = scene.problem
         self.group = symmetries(problem, also=also) if symmetry else SymmetryGroup.identity(problem)
-        self.extra_inputs = ("parameters",) if scene.loads.parameter_ranges else ()
         self.linear = LinearResponse(scene, self.group)
+        self._has_loops = isinstance(one_law(problem.reference.material), InvariantBasedMaterial)
         for name, (shape, dtype) in self._layout().items():
             self.register_buffer(name, torch.zeros(shape, dtype=dtype))
         self._stiffness = ReducedStiffness(self.stiffness, self.linear.terms)
-        self._compiled: tuple[Tensor, ModelArrays, Tensor] | None = None
-        self._law_of_samples = scene.problem.material  # perhaps with ranges
-        self._last: tuple[Tensor, Tensor, tuple[LawArguments, Array, _Solve]] | None = None
-        dofs = scene.problem.free.flatten().nonzero()[:, 0]
-        self.register_buffer("dofs", dofs, persistent=False)
-        self.register_buffer("prescribed", scene.problem.prescribed, persistent=False)
+        self._law_of_samples = problem.material  # perhaps with ranges
+        self._last: tuple[Tensor, tuple[LawArguments, Array, Solve]] | None = None
+        self.register_buffer("dofs", problem.free.flatten().nonzero()[:, 0], persistent=False)
+        self.register_buffer("prescribed", problem.prescribed, persistent=False)
 
     def _layout(
         self, modes: int = 0, cells: int = 0, maps: int = 0, newton_modes: int = 0, newton: int = 0
@@ -182,9 +177,7 @@ class Unrolled(StoredBuffers):
     def forward(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return displacements over L (B, N, D) [-] of forces (B, N, D) [-].
 
-        Args:
-            force: Nodal forces.
-            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
+        The parameters (B, P) of a law with ranges are required.
         """
         return self._fields(force, parameters)[0]
 
@@ -208,8 +201,7 @@ class Unrolled(StoredBuffers):
         frames of the nodes.
         """
         scene, load = self.scene, self.scene.loads.sample((0, SCALE_STREAM), range(FEW))
-        own = (load.parameters,) if self.extra_inputs else ()
-        fields, sizes = self._fields(load.force, *own)
+        fields, sizes = self._fields(load.force, load.parameters)
         pairs = zip(load.unbatch(), fields.split(1), strict=True)
         measured = [estimate_error(scene.linear, *pair, products=0).error for pair in pairs]
         ratio = float((torch.tensor(measured) / self._stored_errors(sizes)[:, 0]).max())
@@ -217,39 +209,30 @@ class Unrolled(StoredBuffers):
 
     def _fields(self, force: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return displacements and the sizes of their corrections, (B, K + 2), see `Maps`."""
-        given = self._given_parameters(force, parameters)
-        if self._is_compiled(force, given):
-            return self._compiled_fields(force, given)
-        loaded = force.flatten(1)[:, self.dofs]
-        linear = self.linear(loaded, given)
-        coordinates, sizes = self.coordinates(loaded, given)
-        return self._field(linear + self._at_free_dofs(coordinates)), sizes
-
-    def coordinates(self, loaded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return coordinates (B, R) of the nonlinear displacement, and sizes, see `Maps`.
-
-        Args:
-            loaded: Forces at free degrees of freedom, (B, n).
-            parameters: Parameters of the law, (B, P).
-        """
-        law = self.scene.problem.material
+        if parameters is None:
+            if names := list(self.scene.loads.parameter_ranges):
+                raise ValueError(f"parameters are an input of this model; give {names}, (B, P)")
+            parameters = force.new_zeros(force.shape[0], 0)
+        if self._is_compiled(force, parameters):
+            return self._compiled_fields(force, parameters)
+        loaded, law = force.flatten(1)[:, self.dofs], self.scene.problem.material
         factors = self.linear.terms.factors(law.with_parameters(parameters))
-        linear = self._stiffness.solve(factors, loaded @ self.modes.to(loaded))
-        cells = SampleCells(self.gradients.to(linear))
-        matrices = self.first_map.to(linear), list(self.maps.to(linear))
-        of_cells = self._law_of_samples.with_parameters(parameters)
-        return Maps(cells, *matrices, self.limits)(of_cells, linear)
+        linear = self._stiffness.solve(factors, loaded @ self.modes.to(loaded))  # Galerkin
+        matrices = [self.first_map.to(linear), *self.maps.to(linear)]
+        maps = Maps(SampleCells(self.gradients.to(linear)), matrices, self.limits)
+        coordinates, sizes = maps(self._law_of_samples.with_parameters(parameters), linear)
+        columns = self.linear(loaded, parameters) + coordinates @ self.modes.mT.to(coordinates)
+        fields = self.prescribed.flatten().to(columns).expand(columns.shape[0], -1)
+        return fields.index_copy(1, self.dofs, columns).unflatten(1, self.prescribed.shape), sizes
 
     def _prepare(self) -> None:
-        """Prepare what a traced graph takes as constants, after the buffers have changed."""
+        """Prepare what follows from the buffers, and what a traced graph takes as constants."""
         parts = self.stiffness.detach().cpu().clone()
         self._stiffness = ReducedStiffness(parts, self.linear.terms)
         self._law_of_samples = self.scene.problem.material.of_cells(self.cells.cpu()).centred()
-        self.__dict__.pop("_doubt", None)
-
-    def _at_free_dofs(self, coordinates: Tensor) -> Tensor:
-        """Return V c at free degrees of freedom, (B, n), of c (B, R)."""
-        return coordinates @ self.modes.mT.to(coordinates)
+        self._last = None
+        for name in ("_doubt", "_arrays"):
+            self.__dict__.pop(name, None)
 
     def _is_compiled(self, force: Tensor, parameters: Tensor) -> bool:
         """Return True if compiled loops can predict these loads: on the CPU, no derivatives."""
@@ -260,11 +243,6 @@ class Unrolled(StoredBuffers):
             force.requires_grad or parameters.requires_grad
         )
         return self.is_fitted and not differentiable and self._has_loops
-
-    @cached_property
-    def _has_loops(self) -> bool:
-        """True if there are compiled loops of the law."""
-        return isinstance(one_law(self.scene.problem.reference.material), InvariantBasedMaterial)
 
     def _compiled_fields(self, force: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return the same as `_fields` by compiled loops, on the threads of torch."""
@@ -282,41 +260,25 @@ class Unrolled(StoredBuffers):
         on_threads(predict_one, range(len(forces)))
         return fields, sizes
 
-    @property
+    @cached_property
     def _arrays(self) -> tuple[ModelArrays, Tensor]:
-        """Arrays of the compiled prediction with the present buffers, see `model_arrays`."""
-        if self._compiled is None or self._compiled[0] is not self.maps:
-            images = self.group.cell_images(self.scene.problem)[:, self.cells]
-            buffers = {name: getattr(self, name) for name in self._layout()}
-            arrays = model_arrays(self.linear, torch.searchsorted(self.cells, images), buffers)
-            self._compiled = self.maps, *arrays
-        return self._compiled[1:]
+        """Arrays of the compiled prediction, see `model_arrays`."""
+        images = self.group.cell_images(self.scene.problem)[:, self.cells]
+        buffers = {name: getattr(self, name) for name in self._layout()}
+        return model_arrays(self.linear, torch.searchsorted(self.cells, images), buffers)
 
-    def _at(self, parameters: Tensor) -> tuple[LawArguments, Array, _Solve]:
+    def _at(self, parameters: Tensor) -> tuple[LawArguments, Array, Solve]:
         """Return law, reduced inverse and linear solution of parameters (1, P), the last kept."""
         last = self._last  # read once: another thread may replace it
-        if last and last[0] is self.stiffness and torch.equal(last[1], parameters):
-            return last[2]
+        if last and torch.equal(last[0], parameters):
+            return last[1]
         law = self.scene.problem.material.with_parameters(parameters)
         of_cells = one_law(law.of_cells(self.cells[self._arrays[1]]).centred())
         inverse, _ = self._stiffness.inverse(self.linear.terms.factors(law))
         arguments = law_arguments(cast("InvariantBasedMaterial", of_cells))
         found = arguments, inverse, self.linear.at(law)
-        self._last = self.stiffness, parameters.clone(), found
+        self._last = parameters.clone(), found
         return found
-
-    def _given_parameters(self, force: Tensor, parameters: Tensor | None) -> Tensor:
-        if parameters is not None:
-            return parameters
-        if self.extra_inputs:
-            names = list(self.scene.loads.parameter_ranges)
-            raise ValueError(f"parameters are an input of this model; give {names}, (B, P)")
-        return force.new_zeros(force.shape[0], 0)
-
-    def _field(self, columns: Tensor) -> Tensor:
-        """Return fields (B, N, D) of values at free degrees of freedom, (B, n)."""
-        fields = self.prescribed.flatten().to(columns).expand(columns.shape[0], -1)
-        return fields.index_copy(1, self.dofs, columns).unflatten(1, self.prescribed.shape)
 
     # ------------------------------------------------------------------ fit
 
@@ -326,35 +288,23 @@ class Unrolled(StoredBuffers):
         return bool(self.fitted)
 
     def fit(self, samples: Sample, held_out: Sample) -> None:
-        """Compute modes, sample cells and maps.
+        """Compute modes, sample cells and maps; Newton's method in modes; and estimated errors.
 
         Args:
             samples: Dimensionless samples to fit to, (S, N, D).
-            held_out: Samples by whose error the numbers of modes, cells and maps are chosen.
+            held_out: Samples by whose errors numbers of modes, cells and maps are chosen, and to
+                which the estimated errors are fitted.
 
         Raises:
             ValueError: There are too few samples, or they are not finite.
         """
-        problem = self.scene.problem
         options = {"rank": self.rank, "cells": self.sample_count, "stages": self.stages}
-        best, every = fit_in_best_modes(
-            problem, self.group, self.linear, (samples, held_out), **options
-        )
+        best, every = fit_in_best_modes(self.linear, (samples, held_out), **options)
         for name, buffer in best.items():
             setattr(self, name, buffer)
         self._prepare()
         self.fitted = torch.tensor(True)
-        self._fit_newton(every, samples, held_out)
-
-    def _fit_newton(self, every: Tensor, samples: Sample, held_out: Sample) -> None:
-        """Choose modes and cells of Newton's method, and fit the errors to held-out samples.
-
-        Args:
-            every: Modes to choose from, the most important one first, (n, R).
-            samples, held_out: See `fit`.
-        """
-        own = (held_out.parameters,) if self.extra_inputs else ()
-        guesses, sizes = self._fields(held_out.force, *own)
+        guesses, sizes = self._fields(held_out.force, held_out.parameters)
         few = Sample(*(column[:LOADS] for column in held_out))
         problem, states = self.scene.problem, samples.displacement
         vectors = orthonormal_fields(every, problem.free)

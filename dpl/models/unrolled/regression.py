@@ -12,20 +12,6 @@ ROUNDING = 1e-10  # norm of a feature over the largest below which it is roundin
 LEAST = 1e-12  # part of a row that the other rows never predict [-]
 
 
-class Rows(NamedTuple):
-    """Rows of a regression.
-
-    Attributes:
-        features: (S, C, F, D, D): F tensors at each of C sample cells.
-        targets: (S, R).
-        weights: Factor of each row, (S,).
-    """
-
-    features: Tensor
-    targets: Tensor
-    weights: Tensor
-
-
 def weighted_error(error: Tensor, weights: Tensor) -> float:
     """Return the mean of the weighted norms of the rows of errors (S, R); inf for NaN.
 
@@ -55,7 +41,12 @@ class MapParities(NamedTuple):
 
 
 def fit_map(
-    rows: Rows, symmetry: MapParities, prior: Tensor, images: int = 1
+    features: Tensor,
+    targets: Tensor,
+    weights: Tensor,
+    symmetry: MapParities,
+    prior: Tensor,
+    images: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """Return the linear map (C F D D, R) from features to targets, and left-out errors (S, R).
 
@@ -72,7 +63,9 @@ def fit_map(
     errors).
 
     Args:
-        rows: Rows to fit to.
+        features: F tensors at each of C sample cells, (S, C, F, D, D).
+        targets: Wanted coordinates, (S, R).
+        weights: Factor of each row, (S,).
         symmetry: Parities of features and targets.
         prior: Map that the ridge shrinks to, (C F D D, R).
         images: Number of rows of each sample, its images; row k S / images + s belongs to sample s.
@@ -80,67 +73,54 @@ def fit_map(
     Raises:
         ValueError: The rows are not finite.
     """
-    features, weights = rows.features.flatten(1), rows.weights[:, None]
-    rest = rows.targets - features @ prior
+    orbits, weights = symmetry.orbits(features.shape[2]), weights[:, None]
+    features = features.flatten(1)
+    rest = targets - features @ prior
     if not (features.isfinite().all() and rest.isfinite().all()):
         raise ValueError("the samples are not finite")
-    orbits, squares = symmetry.orbits(rows.features.shape[2]), torch.zeros(len(RIDGES), len(rest))
-    blocks = []
+    squares, blocks = torch.zeros(len(RIDGES), len(rest)), []
     for p, characters in enumerate(symmetry.parities.characters):
         own = symmetry.coordinates == p
         X = weights * orbits.coordinates(features, characters)
-        path = _RidgePath.of(X, weights * rest[:, own], images)
-        blocks.append((own, characters, path))
-        squares = squares + path.errors.square().sum(dim=2)
+        errors, solved, basis = _ridge_path(X, weights * rest[:, own], images)
+        blocks.append((own, characters, errors, solved, basis))
+        squares = squares + errors.square().sum(dim=2)
     chosen = int(squares.sqrt().mean(dim=1).argmin())
     matrix, left_out = torch.zeros_like(prior), torch.empty_like(rest)
-    for own, characters, path in blocks:
-        change = path.basis @ path.solved[chosen]
+    for own, characters, errors, solved, basis in blocks:
+        change = basis @ solved[chosen]
         matrix[:, own] = prior[:, own] + orbits.fields(change.T, characters, len(prior)).T
-        left_out[:, own] = path.errors[chosen]
+        left_out[:, own] = errors[chosen]
     left_out = left_out / weights.clamp(min=torch.finfo(torch.float64).tiny)
-    return matrix, torch.where(weights > 0, left_out, rows.targets - features @ matrix)
+    return matrix, torch.where(weights > 0, left_out, targets - features @ matrix)
 
 
-class _RidgePath(NamedTuple):
-    """Regressions of rows for all ridges.
+def _ridge_path(X: Tensor, Y: Tensor, images: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return left-out errors (K, n, R), solutions (K, k, R) and their basis (p, k) for all ridges.
 
-    Attributes:
-        errors: Left-out errors, (K, n, R).
-        solved: Solutions in the basis, (K, k, R).
-        basis: (p, k): the map of ridge number j is `basis @ solved[j]`.
+    X is (n, p) and Y is (n, R), with so many rows of each sample. The map of ridge number j is
+    `basis @ solutions[j]`. Columns that are zero or rounding errors, as at cells that symmetries
+    map onto themselves, have no effect. A regression with fewer rows than features is solved in as
+    many unknowns as rows: (X^T X + r)^-1 X^T Y = X^T (X X^T + r)^-1 Y.
     """
-
-    errors: Tensor
-    solved: Tensor
-    basis: Tensor
-
-    @classmethod
-    def of(cls, X: Tensor, Y: Tensor, images: int) -> "_RidgePath":
-        """Solve for X (n, p) and Y (n, R) with so many rows of each sample.
-
-        Columns that are zero or rounding errors, as at cells that symmetries map onto themselves,
-        have no effect. A regression with fewer rows than features is solved in as many unknowns as
-        rows: (X^T X + r)^-1 X^T Y = X^T (X X^T + r)^-1 Y.
-        """
-        size = torch.linalg.vector_norm(X, dim=0)
-        factors = torch.where(size > ROUNDING * size.max(), 1 / size, 0.0)
-        X = X * factors
-        is_dual = len(X) <= X.shape[1]
-        values, Q = torch.linalg.eigh(X @ X.T if is_dual else X.T @ X)
-        T = Q if is_dual else X @ Q
-        shifts = X.shape[1] * X.new_tensor(RIDGES)[:, None, None]
-        inverse = 1 / (values.clamp(min=0) + shifts[:, 0])  # (K, k)
-        solved = inverse[:, :, None] * (T.T @ Y)
-        fitted = T @ solved  # (K, n, R)
-        of_samples = T.unflatten(0, (images, -1))
-        rows = [[(a * b) @ inverse.T for b in of_samples] for a in of_samples]
-        products = torch.stack([torch.stack(row) for row in rows]).permute(3, 2, 0, 1)
-        one = torch.eye(images, dtype=X.dtype)
-        if is_dual:
-            error, part = fitted, products
-        else:
-            error, part = Y - fitted, (1 + LEAST) * one - products
-        own = error.unflatten(1, (images, -1)).transpose(1, 2)  # (K, S, images, R)
-        left_out = torch.linalg.solve(part, own).transpose(1, 2).flatten(1, 2)
-        return cls(left_out, solved, factors[:, None] * (X.T @ Q if is_dual else Q))
+    size = torch.linalg.vector_norm(X, dim=0)
+    factors = torch.where(size > ROUNDING * size.max(), 1 / size, 0.0)
+    X = X * factors
+    is_dual = len(X) <= X.shape[1]
+    values, Q = torch.linalg.eigh(X @ X.T if is_dual else X.T @ X)
+    T = Q if is_dual else X @ Q
+    shifts = X.shape[1] * X.new_tensor(RIDGES)[:, None]
+    inverse = 1 / (values.clamp(min=0) + shifts)  # (K, k)
+    solved = inverse[:, :, None] * (T.T @ Y)
+    fitted = T @ solved  # (K, n, R)
+    of_samples = T.unflatten(0, (images, -1))
+    rows = [[(a * b) @ inverse.T for b in of_samples] for a in of_samples]
+    products = torch.stack([torch.stack(row) for row in rows]).permute(3, 2, 0, 1)
+    one = torch.eye(images, dtype=X.dtype)
+    if is_dual:
+        error, part = fitted, products
+    else:
+        error, part = Y - fitted, (1 + LEAST) * one - products
+    own = error.unflatten(1, (images, -1)).transpose(1, 2)  # (K, S, images, R)
+    left_out = torch.linalg.solve(part, own).transpose(1, 2).flatten(1, 2)
+    return left_out, solved, factors[:, None] * (X.T @ Q if is_dual else Q)
