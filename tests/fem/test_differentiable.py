@@ -83,15 +83,6 @@ def test_the_gradient_by_young_and_force_is_the_difference_quotient(scene, batch
     assert torch.allclose((by_force * newtons).sum(dim=(1, 2)), -by_young * young, rtol=1e-8)
 
 
-def test_a_batch_has_the_gradients_of_its_members(equilibrium, force):
-    inner = force.clone().requires_grad_()
-    (whole,) = torch.autograd.grad(seen(equilibrium(load_of(inner))).sum(), inner)
-    for k in range(2):
-        one = force[k : k + 1].clone().requires_grad_()
-        (slope,) = torch.autograd.grad(seen(equilibrium(load_of(one))).sum(), one)
-        assert torch.allclose(whole[k], slope[0], rtol=1e-9, atol=1e-12 * float(slope.abs().max()))
-
-
 def test_repeated_gradients_take_one_factorisation(equilibrium, force, monkeypatch):
     answer = equilibrium(load_of(force.clone().requires_grad_()))
     made = []
@@ -100,17 +91,6 @@ def test_repeated_gradients_take_one_factorisation(equilibrium, force, monkeypat
     for component in answer[:, -1].sum(dim=0):
         component.backward(retain_graph=True)
     assert len(made) == 2  # of two loads
-
-
-def test_linear_bodies_have_the_same_gradient_everywhere(beam, pull):
-    problem = beam(fem.LinearElastic(0.3), n=4, m=1)
-    equilibrium = fem.DifferentiableSolve(fem.Newton(problem, linear="superlu"))
-    force = torch.cat([pull(problem, 0.01), pull(problem, 1.0)]).requires_grad_()
-    weight = noise(*problem.shape)
-    (slope,) = torch.autograd.grad((equilibrium(load_of(force)) * weight).sum(), force)
-    adjoint = equilibrium.newton.linear_solver.solve(weight)
-    assert torch.allclose(slope[0], adjoint, rtol=1e-8, atol=1e-10)
-    assert torch.allclose(slope[1], adjoint, rtol=1e-8, atol=1e-10)
 
 
 def test_moved_supports_and_springs_are_included(pull):

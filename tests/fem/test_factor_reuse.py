@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
-from itertools import cycle, pairwise
+from itertools import cycle
 
 import numpy as np
 import pytest
@@ -149,19 +149,6 @@ def test_factorisations_of_a_batch_are_all_counted(beam, pull, counted):
     assert int(answer.factorisations.sum()) == len(counted)
     assert (answer.factorisations > 0).all()
     assert (answer.factorisations < answer.iterations - 1).all()
-
-
-def test_factors_are_reused_only_below_factor_reuse_tol(beam, pull):
-    problem, reuse = beam(NH), 0.1
-    solver = fem.Newton(problem, linear="superlu", factor_reuse_tol=reuse)
-    made, before = [], 1.0
-    for state in solver.iterate(load_of(pull(problem, 80.0))):
-        made.append((before, state.factorisations.item()))
-        before = state.residual.item()
-    new = [b - a for (_, a), (_, b) in pairwise(made)]
-    ratios = [ratio for ratio, _ in made[1:]]
-    assert all(n == 1 for n, ratio in zip(new[1:], ratios[1:], strict=True) if ratio >= reuse)
-    assert any(n == 0 for n, ratio in zip(new[1:], ratios[1:], strict=True) if ratio < reuse)
 
 
 def test_poor_preconditioner_is_replaced_after_the_largest_number_of_steps(

@@ -1,7 +1,5 @@
 """Slender beams and tiny loads: what `benchmarks.stress` does not assert of its cases T5 and T6."""
 
-from itertools import cycle
-
 import pytest
 from laws import ISOTROPIC, LAWS
 
@@ -23,7 +21,9 @@ def test_slender_beam_takes_steps_where_one_does_not_do(mixed):
     assert stepped != mixed  # mixed points spare the steps
 
 
-@pytest.mark.parametrize(("name", "q"), zip(ISOTROPIC, cycle([1e-2, 1e-12])))
+@pytest.mark.parametrize(
+    ("name", "q"), [*((name, 1e-12) for name in ISOTROPIC), ("neo_hookean_ln", 1e-2)]
+)
 def test_tiny_load_of_isotropic_laws_ends_at_the_linear_answer(beam, pull, corner, name, q):
     """Stress case T6: u / q within 1e-6 of the linear one; no law stalls above 1e-8."""
     problem = beam(LAWS[name])

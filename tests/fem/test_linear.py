@@ -334,7 +334,7 @@ def of_contrast(contrast: float) -> Problem:
     return Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), supports=[spring])
 
 
-@pytest.mark.parametrize("contrast", [1e-6, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("contrast", [1e-6, 1e9])
 def test_stiffnesses_far_apart_are_solved_to_rounding(direct, contrast):
     """Without iterative refinement."""
     pattern, values = system(of_contrast(contrast))

@@ -115,9 +115,6 @@ class BandedCholesky:
 
     def definite(self, values: Array) -> Factor | None:
         """Return the factor; None if the matrix may not be positive definite, see `Backend`."""
-        return self._cholesky(values)
-
-    def _cholesky(self, values: Array) -> BandedFactor | None:
         require_finite(values)
         layout = self.layout
         storage = np.zeros((self.pattern.size, layout.half + 1), self.dtype)
@@ -153,7 +150,7 @@ class MixedPrecisionBandedCholesky(BandedCholesky):
         scale = float(np.sqrt(diagonal.max(initial=0)) * np.sqrt(diagonal.min(initial=np.inf)))
         if 0 < scale < np.inf:
             with np.errstate(over="ignore"):
-                rough = self._cholesky(values / scale)
+                rough = super().definite(values / scale)
             if rough is not None:
                 return MixedPrecisionFactor(self, values.copy(), rough, scale)
         return self.exact.definite(values)
@@ -165,7 +162,7 @@ class MixedPrecisionFactor(Factor):
 
     parent: MixedPrecisionBandedCholesky  # the backend
     values: Array  # entries of the matrix, (nnz,)
-    rough: BandedFactor  # factor of the entries over `scale`
+    rough: Factor  # factor of the entries over `scale`
     scale: float  # size of the entries
     exact: Factor | None = None  # factor in float64, once needed
 

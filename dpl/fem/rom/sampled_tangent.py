@@ -38,14 +38,15 @@ class SampledTangent:
 
     def __init__(self, problem: Problem, vectors: Tensor, cubature: Cubature | None) -> None:
         """Reduce a body to V (N, D, R) and to weighted cells; None: all cells, not sampled."""
-        self.problem, self._cells = problem, None if cubature is None else cubature.cells
+        self.problem, self._has_cells = problem, cubature is not None
         scale = whitening(problem.reference, vectors)
         white = vectors @ scale
         self.scale, self._white = scale.numpy(), white[problem.free].numpy()
         self.rows: Single = white.flatten(0, 1).float().numpy()
         if cubature is not None:
-            sampled = ReducedMesh(problem, white, cubature.cells, cubature.weights.double())
-            dN, dV, nodes = sampled.problem.dN, sampled.problem.dV, problem.cells[cubature.cells]
+            self._cells = cubature.cells
+            sampled = ReducedMesh(problem, white, self._cells, cubature.weights.double())
+            dN, dV, nodes = sampled.problem.dN, sampled.problem.dV, problem.cells[self._cells]
             volume = dV.sum(dim=1, keepdim=True)
             mean = (dN * (dV / volume)[..., None, None]).sum(dim=1)  # (C, A, D)
             basis = torch.einsum("cair,caj->cijr", white[nodes], mean).flatten(1, 2)
@@ -59,7 +60,7 @@ class SampledTangent:
         Only its symmetric part has a meaning; rounding makes the matrix slightly unsymmetric. With
         `whole` it sums over all cells instead of the chosen ones.
         """
-        if whole or self._cells is None:
+        if whole or not self._has_cells:
             tangent = problem.linearise(displacement[None]).tangent[0].numpy()
             return self._white.T @ (full_matrix(problem.pattern, tangent) @ self._white)
         product, rank = self._moduli_change_product(problem, displacement), len(self.scale)
