@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.linalg import cho_solve, solve_triangular
 from torch import Tensor
 
 from dpl.fem.assembly.follower_loads import NO_LOADS
@@ -105,7 +105,7 @@ def nonnegative(
     count = len(gram)
     length_of = np.sqrt(gram.diagonal())
     length_of[length_of == 0] = np.inf
-    rows = np.empty((count, count))  # memory is used when it is written
+    rows, factor = np.empty((count, count)), np.empty((count, count))  # memory used when written
     kept, weights, barred = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(count, dtype=bool)
     gradient = target
     error = float(np.sqrt(max(size, 0.0))) / scale
@@ -116,22 +116,21 @@ def nonnegative(
         if gain[new] <= 0:
             break
         rows[len(kept)] = gram[new]
-        kept, weights = np.append(kept, new), np.append(weights, 0.0)
-        while True:
-            lower, failed = dpotrf(gram[np.ix_(kept, kept)], lower=1)
-            if failed or (lower.diagonal() ** 2 <= 1e-12 * gram[kept, kept]).any():
-                kept, weights = kept[:-1], weights[:-1]  # linearly dependent on the others
-                break
-            best = dpotrs(lower, target[kept], lower=1)[0]
+        kept, weights, first = np.append(kept, new), np.append(weights, 0.0), len(kept)
+        while _factorised(factor, gram, kept, first):
+            lower = factor[: len(kept), : len(kept)]
+            best = cho_solve((lower, True), target[kept], check_finite=False)
             if (falling := best <= 0).any():
                 length = (weights[falling] / (weights[falling] - best[falling])).min()
                 weights += length * (best - weights)
                 stay = ~falling | (weights > 1e-12 * weights.max())
                 rows[: stay.sum()] = rows[: len(kept)][stay]
-                kept, weights = kept[stay], weights[stay]
+                kept, weights, first = kept[stay], weights[stay], int(stay.argmin())
             else:
                 weights = best
                 break
+        else:  # linearly dependent on the others
+            kept, weights = kept[:-1], weights[:-1]
         if new in kept:
             barred[:] = False
         else:  # entered because of rounding
@@ -143,6 +142,21 @@ def nonnegative(
         kept, weights = np.zeros(1, dtype=np.int64), np.ones(1)
     order = kept.argsort()
     return Cubature(torch.from_numpy(kept[order]), torch.from_numpy(weights[order]), error)
+
+
+def _factorised(factor: Array, gram: Array, kept: NDArray[np.int64], first: int) -> bool:
+    """Set rows from `first` of the Cholesky factor of gram[kept, kept]; False if singular."""
+    old, new = kept[:first], kept[first:]
+    block = gram[np.ix_(new, new)]
+    if first:
+        right = gram[np.ix_(old, new)]
+        left = solve_triangular(factor[:first, :first], right, lower=True, check_finite=False).T
+        factor[first : len(kept), :first] = left
+        block -= left @ left.T
+    if (block.diagonal() <= 1e-12 * gram[new, new]).any():
+        return False
+    factor[first : len(kept), first : len(kept)] = np.linalg.cholesky(block)
+    return True
 
 
 class ReducedMesh:

@@ -114,30 +114,36 @@ class RigidPatch:
 
     def at(self, values: Tensor) -> Tensor:
         """Return the nodal field, (N, D), with values (m,) at held degrees of freedom, else 0."""
-        return torch.zeros(self.held.shape, dtype=torch.float64).masked_scatter(self.held, values)
+        field = torch.zeros(self.held.numel(), dtype=torch.float64)
+        return field.index_copy(0, self._dofs, values).view(self.held.shape)
 
     def of_field(self, field: Tensor) -> Tensor:
         """Return the values, (m,), of a nodal field (N, D) at held degrees of freedom."""
-        return field[self.held]
+        return field.reshape(-1)[self._dofs]
 
     @cached_property
-    def _places(self) -> NDArray[np.int64]:
+    def _dofs(self) -> Tensor:
+        """Numbers of the held degrees of freedom, (m,); a mask takes longer."""
+        return self.held.flatten().nonzero()[:, 0]
+
+    @cached_property
+    def places(self) -> NDArray[np.int64]:
         """Numbers of the held ones among the free degrees of freedom, (m,)."""
         return np.flatnonzero(self.held[self.problem.free].numpy())
 
     @property
     def missing_rows(self) -> int:
         """Number of rows of the compliance that are not computed."""
-        return len(self._places) - sum(map(len, self._rows))
+        return len(self.places) - sum(map(len, self._rows))
 
     def prepare(self, *, one: bool = False) -> None:
         """Compute the rows of the compliance that are left, or the next one."""
-        places = self._places[len(self._places) - self.missing_rows :][: 1 if one else None]
+        places = self.places[len(self.places) - self.missing_rows :][: 1 if one else None]
         right = np.zeros((len(places), self.problem.pattern.size))
         right[np.arange(len(places)), places] = 1.0
         factor = self.linear.float32_factor  # a block of one row takes longer than one solve
         rows = factor.solve(right[0], RTOL)[None] if one else factor.solve_many(right, RTOL)
-        self._rows.append(torch.from_numpy(rows[:, self._places]))
+        self._rows.append(torch.from_numpy(rows[:, self.places]))
 
     @cached_property
     def _rows(self) -> list[Tensor]:
@@ -186,10 +192,10 @@ class RigidPatch:
         frames = self.linear.corotational.at(displacement[None]).rotations
         turns = torch.from_numpy(frames)[:, :dim, :dim]
         missing = self.at(goal - self.of_field(displacement))
-        gap = torch.einsum("nji,nj->ni", turns, missing)
+        gap = (turns.mT @ missing[..., None])[..., 0]
         force = problem.restrict(self.at(self.stiffness_times(self.of_field(gap))))
         added = problem.extend(self.linear.float32_factor.solve(force))
-        return displacement + torch.einsum("nij,nj->ni", turns, added)
+        return displacement + (turns @ added[..., None])[..., 0]
 
     def wrench(self, force: Tensor, displacement: Tensor) -> Wrench:
         """Return the resultant of nodal forces (N, D) [-] on the patch at a displacement (N, D)."""
@@ -225,7 +231,8 @@ class _HeldFactor(Factor):
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right, in the accuracy of float32."""
         patch, factor = self.patch, self.patch.linear.float32_factor
-        held = self.patch.held[self.patch.problem.free].numpy()
+        held = np.zeros(len(right) + len(patch.places), dtype=bool)
+        held[patch.places] = True
         force = np.zeros(len(held))
         force[~held] = right
         moved = torch.from_numpy(factor.solve(force)[held])
