@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem import Load, Newton, Problem, SingularMatrix, Solution, evaluate_solution
-from dpl.fem.solvers import run_lockstep
+from dpl.fem.solvers.solution import run_lockstep
 
 
 @dataclass(frozen=True, eq=False)

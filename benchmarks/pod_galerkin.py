@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem import LinearSolver, Problem
-from dpl.fem.rom import Cubature, cubature
-from dpl.fem.rom.ecsw import ReducedMesh, refuse_follower_loads, whitening
+from dpl.fem.rom.ecsw import Cubature, ReducedMesh, cubature, refuse_follower_loads, whitening
 from dpl.fem.rom.pod import pod
 from dpl.fem.solvers.newton import LoadStepping
 

@@ -23,7 +23,6 @@ from dpl.fem import (
 )
 from dpl.fem.identity import plain, sha256_of
 from dpl.fem.linear.backends import factorisation_work
-from dpl.fem.solvers.corotational import CorotationalPreconditioner
 from dpl.fem.solvers.solution import as_column
 
 CORRECTOR_STREAM = 6  # stream of the loads on which the corrector is chosen
@@ -121,7 +120,7 @@ class Scene:
         It is on compact bodies, seldom on thin ones. The mean number of steps of conjugate
         gradients decides.
         """
-        steps = [self._corotational(load).count_iterations(u) for load, u in self._typical_states]
+        steps = [self._linear(load).count_iterations(u) for load, u in self._typical_states]
         return sum(steps) <= MAX_MEAN_STEPS * len(steps)
 
     @cached_property
@@ -131,7 +130,7 @@ class Scene:
         The eigenvalues are relative to K(0) in the rotated frames of the nodes.
         """
         states = self._typical_states
-        values = (self._corotational(load).smallest_ritz_value(u) for load, u in states)
+        values = (self._linear(load).smallest_ritz_value(u) for load, u in states)
         return min(values) < SOFTENED
 
     @cached_property
@@ -140,8 +139,8 @@ class Scene:
         loads = self.loads.sample((0, CORRECTOR_STREAM), range(3)).unbatch()
         return [(load, solve(self.solver, load).displacement) for load in loads]
 
-    def _corotational(self, load: Load) -> CorotationalPreconditioner:
-        return self.linear.with_parameters(load.parameters).corotational
+    def _linear(self, load: Load) -> LinearSolver:
+        return self.linear.with_parameters(load.parameters)
 
     @property
     def length(self) -> float:

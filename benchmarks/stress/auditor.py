@@ -117,7 +117,7 @@ class Auditor:
         here, rest = (body.linearise(u).tangent[0] for u in (displacement, 0 * displacement))
         values = (here + CRITICAL_LOAD_TOL * rest).numpy()
         try:
-            return factoriser.factorise(values).stability()
+            return factoriser.factorise(values).stability
         except SingularMatrix:
             return 0
 

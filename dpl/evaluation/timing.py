@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dpl.evaluation.tables import NETWORK, SIMULATOR
 from dpl.fem import Load, Solution, Solver, solve
-from dpl.fem.solvers import concatenate
+from dpl.fem.solvers.solution import concatenate
 from dpl.inference import Simulator
 from dpl.system.threads import one_thread
 

@@ -15,7 +15,7 @@ from dpl.fem import (
     SubspaceNewton,
     evaluate_solution,
 )
-from dpl.fem.solvers import check_tol, run_lockstep
+from dpl.fem.solvers.solution import check_tol, run_lockstep
 from dpl.scene import Scene
 
 Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from dpl.fem import Load, Problem, Solution, evaluate_solution
 from dpl.fem.problem import Evaluation
-from dpl.fem.solvers import check_tol
 from dpl.fem.solvers.error_estimate import PRODUCTS
+from dpl.fem.solvers.solution import check_tol
 from dpl.inference.arguments import as_number
 from dpl.scene import Scene
 

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from benchmarks.pod_galerkin import TOL, PODGalerkin
 from dpl import fem
-from dpl.fem.rom import Cubature
+from dpl.fem.rom.ecsw import Cubature
 
 NH = fem.NeoHookeanLn(0.3)
 

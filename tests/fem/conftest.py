@@ -7,14 +7,12 @@ import pytest
 import skfem
 import torch
 from laws import LAWS
-from solving import LENGTH, YOUNG
+from solving import KINDS, LENGTH, YOUNG
 from torch import Tensor
 
 from dpl import fem
 from dpl.fem.linear import SuperLU
 from dpl.fem.loads import traction
-
-KINDS = [(cell, d) for cell in ("triangle", "quad", "tetra", "hexahedron") for d in (1, 2)]
 
 
 @pytest.fixture(params=[fem.SaintVenantKirchhoff, fem.NeoHookeanLn], ids=["svk", "neo-hookean"])

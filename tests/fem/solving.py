@@ -9,6 +9,7 @@ from dpl import fem
 from dpl.fem.linear import SuperLU, full_matrix
 
 YOUNG, LENGTH = 4500.0, 100.0  # of the paper's beam [Pa], [m]
+KINDS = [(cell, d) for cell in ("triangle", "quad", "tetra", "hexahedron") for d in (1, 2)]
 
 
 class Uncompiled(fem.Problem):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dpl import fem
-from dpl.fem.solvers import unstable_directions
+from dpl.fem.solvers.bifurcation import unstable_directions
 
 
 @pytest.fixture(scope="module")

@@ -29,9 +29,15 @@ def bend(problem, total):
     return load_of(force[None])
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize(("angle", "stretches"), [(1e-3, (1.3, 0.8, 1.1)), (3.0, (20, 0.05, 3))])
+@pytest.mark.parametrize(
+    ("dim", "degree", "angle", "stretches"),
+    [
+        (2, 1, 3.0, (20, 0.05)),
+        (2, 2, 1e-3, (1.3, 0.8)),
+        (3, 1, 1e-3, (1.3, 0.8, 1.1)),
+        (3, 2, 3.0, (20, 0.05, 3)),
+    ],
+)
 def test_nodes_are_rotated_by_the_rotation_of_their_gradient(dim, degree, angle, stretches):
     problem = body(dim, degree=degree)
     axis = np.array([1.0, 2.0, 3.0]) / math.sqrt(14)
@@ -48,17 +54,16 @@ def test_nodes_are_rotated_by_the_rotation_of_their_gradient(dim, degree, angle,
     assert (rotated.rotations[:, dim:] == np.eye(3)[dim:]).all()
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_node_fixed_in_one_direction_is_rotated_about_it(axis):
-    sides = [None, None, None]
-    sides[axis] = 0.0
-    problem = body(supports=[fem.DirichletBC(fem.Plane(1, "min"), sides)])
-    turn = Rotation.from_rotvec(0.7 * np.eye(3)[axis]).as_matrix()
-    u = problem.points @ torch.from_numpy(turn - np.eye(3)).T
-    rotated = fem.LinearSolver(problem).corotational.at(u[None])
-    partly = (problem.free.sum(dim=1) == 2).numpy()
-    assert partly.sum() > 10
-    assert np.allclose(rotated.rotations[partly], turn, atol=1e-8)
+def test_a_node_fixed_in_one_direction_is_rotated_about_it():
+    for axis in range(3):
+        sides = [0.0 if i == axis else None for i in range(3)]
+        problem = body(supports=[fem.DirichletBC(fem.Plane(1, "min"), sides)])
+        turn = Rotation.from_rotvec(0.7 * np.eye(3)[axis]).as_matrix()
+        u = problem.points @ torch.from_numpy(turn - np.eye(3)).T
+        rotated = fem.LinearSolver(problem).corotational.at(u[None])
+        partly = (problem.free.sum(dim=1) == 2).numpy()
+        assert partly.sum() > 10
+        assert np.allclose(rotated.rotations[partly], turn, atol=1e-8)
 
 
 def test_nodes_fixed_in_two_directions_or_of_an_inverted_body_are_not_rotated():
@@ -78,11 +83,10 @@ def test_at_rest_the_preconditioner_is_the_inverse_of_the_stiffness():
     right = np.random.default_rng(0).standard_normal(problem.pattern.size)
     ours, exact = linear.corotational.at(zero).apply(right), linear.factor.solve(right)
     assert np.linalg.norm(ours - exact) < 1e-4 * np.linalg.norm(exact)
-    assert linear.corotational.count_iterations(zero) == 1
+    assert linear.count_iterations(zero) == 1
 
 
-@pytest.mark.parametrize("backend", ["auto", "superlu"])
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(("dim", "backend"), [(2, "superlu"), (3, "auto")])
 def test_the_preconditioner_is_symmetric_and_positive_definite(dim, backend):
     problem = body(dim)
     random = np.random.default_rng(1)
@@ -98,11 +102,8 @@ def test_the_preconditioner_is_symmetric_and_positive_definite(dim, backend):
 @pytest.mark.parametrize(
     ("mixed", "options"),
     [
-        (True, {}),
         (False, {}),
         (True, {"law": SVK}),
-        (False, {"dim": 2}),
-        (True, {"degree": 2}),
         (False, {"dim": 2, "degree": 2}),
         (False, {"mean_dilatation": True}),
         (True, {"law": fem.NeoHookeanLn(0.49), "mean_dilatation": True}),
@@ -125,11 +126,11 @@ def test_newton_has_the_same_solution_with_the_preconditioner(options, mixed):
 def test_rotation_halves_the_iterations_far_from_rest(monkeypatch):
     problem = body()
     answer = fem.solve(fem.Newton(problem), bend(problem, 4e-4)).displacement
-    preconditioner = fem.LinearSolver(problem).corotational
-    rotated = preconditioner.count_iterations(answer)
-    monkeypatch.setattr(type(preconditioner), "at", lambda self, u: self.factor)
+    linear = fem.LinearSolver(problem)
+    rotated = linear.count_iterations(answer)
+    monkeypatch.setattr(type(linear.corotational), "at", lambda self, u: self.factor)
     assert rotated <= 8
-    assert preconditioner.count_iterations(answer) > 2 * rotated
+    assert linear.count_iterations(answer) > 2 * rotated
 
 
 def test_a_tangent_is_factorised_where_the_preconditioner_is_poor():
@@ -149,10 +150,8 @@ def test_a_tangent_is_factorised_where_the_preconditioner_is_poor():
 def test_stability_is_unknown_without_a_factor():
     problem = body()
     load = bend(problem, 2e-4)
-    ours, theirs = (
-        fem.solve(fem.Newton(problem, corotational=True), load),
-        fem.solve(fem.Newton(problem), load),
-    )
+    plain = fem.Newton(problem)
+    ours, theirs = fem.solve(replace(plain, corotational=True), load), fem.solve(plain, load)
     assert not ours.factorisations.any()
     assert ours.negative_pivots.tolist() == [-1]
     assert theirs.negative_pivots.tolist() == [0]

@@ -1,7 +1,8 @@
 """Laws of factor reuse: the same solutions with fewer factorisations."""
 
+from dataclasses import replace
 from functools import partial
-from itertools import cycle, pairwise
+from itertools import cycle
 
 import numpy as np
 import pytest
@@ -52,7 +53,7 @@ def check(every: fem.Solution, few: fem.Solution, *, steps: int = 1, fewer: bool
 @pytest.mark.parametrize(
     ("name", "q", "mixed"),
     [("neo_hookean_ln", q, mixed) for q in (1.0, 20.0, 80.0) for mixed in (False, True)]
-    + list(zip(LAWS, cycle([80.0, 20.0, 1.0]), cycle([True, False]))),
+    + list(zip([*LAWS][::3], cycle([80.0, 20.0, 1.0]), cycle([True, False]))),
 )
 def test_solution_of_any_law_does_not_depend_on_reuse(beam, pull, name, q, mixed):
     problem = beam(LAWS[name])
@@ -61,44 +62,39 @@ def test_solution_of_any_law_does_not_depend_on_reuse(beam, pull, name, q, mixed
     check(every, few, fewer=every.iterations.item() > 2)
 
 
-@pytest.mark.parametrize("size", [0.01, 0.1])
-def test_solution_on_any_element_does_not_depend_on_reuse(grid, kind, size):
+def test_solution_on_any_element_does_not_depend_on_reuse(grid, kind):
     cell, degree = kind
-    mesh = grid(cell, 3, 0.2, inside=True)
+    mesh = grid(cell, 4 - degree, 0.2, inside=True)
     problem = fem.Problem.build(mesh, NH, fixed=fem.Plane(0, "min"), degree=degree)
-    across = [0.0] * (mesh.dim() - 1) + [size]
+    across = [0.0] * (mesh.dim() - 1) + [0.1]
     every, few = pair(problem, load_of(fem.Traction(fem.Plane(0, "max"), across).on(problem)[None]))
     assert every.converged.all()
     check(every, few)
 
 
 @pytest.mark.parametrize("name", fem.installed_backends())
-@pytest.mark.parametrize(("cells", "q"), [((8, 2), 160.0), ((16, 4), 40.0)])
-def test_solution_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cells, q):
-    problem = beam(NH, *cells)
-    every, few = pair(problem, load_of(pull(problem, q)), linear=name)
+def test_solution_of_any_backend_does_not_depend_on_reuse(beam, pull, name):
+    problem = beam(NH, 12, 3)
+    every, few = pair(problem, load_of(pull(problem, 80.0)), linear=name)
     assert every.converged.all()
     check(every, few, fewer=name != "cg" or multigrid_installed())  # the diagonal spares none
 
 
-@pytest.mark.parametrize("q", [160.0, 400.0])
+@pytest.mark.parametrize(("q", "mixed"), [(160.0, True), (400.0, False)])
 def test_large_load_that_takes_steps_does_not_depend_on_reuse(beam, pull, mixed, q):
     problem = beam(NH)
     load = load_of(pull(problem, q))
-    states = list(
-        fem.Newton(
-            problem, linear="superlu", mixed_integration=mixed, factor_reuse_tol=0.0
-        ).iterate(load)
-    )
-    steps = 1 + len({state.load_factor.item() for state in states})
-    every, few = pair(problem, load, mixed_integration=mixed)
+    plain = fem.Newton(problem, linear="superlu", mixed_integration=mixed, factor_reuse_tol=0.0)
+    states = list(plain.iterate(load))
+    steps, every = 1 + len({state.load_factor.item() for state in states}), states[-1]
+    few = fem.solve(replace(plain, factor_reuse_tol=fem.Newton(problem).factor_reuse_tol), load)
     assert every.converged.all()
     check(every, few, steps=steps, fewer=mixed)
 
 
 def test_load_without_a_solution_has_none_with_reuse(beam, pull, mixed):
     problem = beam(SVK)
-    options = {"min_load_step": 2.0**-6, "mixed_integration": mixed}
+    options = {"min_load_step": 2.0**-4, "mixed_integration": mixed}
     every, few = pair(problem, load_of(pull(problem, 400.0)), **options)
     assert every.status.item() == few.status.item() == fem.Status.NO_VALID_EQUILIBRIUM
     assert 0 < few.load_factor.item() < 1
@@ -106,6 +102,7 @@ def test_load_without_a_solution_has_none_with_reuse(beam, pull, mixed):
     assert torch.allclose(few.displacement, every.displacement, rtol=0, atol=1e-2)
 
 
+@pytest.mark.parametrize(("law", "mixed"), [(NH, True), (SVK, False)])
 def test_moved_supports_are_followed_with_reuse(law, mixed):
     mesh = fem.box([1.0, 1.0, 1.0], [4, 4, 4])
     held = mesh.p.T == 0
@@ -119,9 +116,7 @@ def test_moved_supports_are_followed_with_reuse(law, mixed):
         check(every, few)
 
 
-@pytest.mark.parametrize(
-    ("law", "part"), [(NH, 0.5), (SVK, 0.9), (NH, 1.0001), (SVK, 1.0001), (NH, -0.2)]
-)
+@pytest.mark.parametrize(("law", "part"), [(NH, 0.5), (SVK, 1.0001), (NH, -0.2)])
 def test_guess_leads_to_the_same_solution_with_reuse(beam, pull, law, part):
     problem = beam(law)
     load = load_of(pull(problem, 20.0))
@@ -134,40 +129,26 @@ def test_guess_leads_to_the_same_solution_with_reuse(beam, pull, law, part):
     assert few.factorisations.item() >= 1  # the factor of the rest state is near no other
 
 
-@pytest.mark.parametrize("reuse", [0.0, 1e-3, 0.1, 1.0, 1e6])
-def test_more_reuse_means_fewer_factors(beam, pull, reuse):
-    problem = beam(NH, 16, 4)
-    load = load_of(pull(problem, 20.0))
-    counts = {0.0: 4, 1e-3: 3, 0.1: 2, 1.0: 2, 1e6: 1}
-    answer = fem.solve(fem.Newton(problem, linear="superlu", factor_reuse_tol=reuse), load)
-    assert answer.converged.all()
-    assert answer.iterations.item() == 5
-    assert answer.factorisations.item() == counts[reuse]
+def test_more_reuse_means_fewer_factors(beam, pull):
+    problem = beam(NH, 12, 3)
+    newton, load = fem.Newton(problem, linear="superlu"), load_of(pull(problem, 20.0))
+    for reuse, count in {0.0: 4, 1e-3: 3, 0.1: 2, 1e6: 1}.items():
+        answer = fem.solve(replace(newton, factor_reuse_tol=reuse), load)
+        assert answer.converged.all()
+        assert answer.iterations.item() == 5
+        assert answer.factorisations.item() == count
 
 
-@pytest.mark.parametrize("q", [5.0, 40.0, 160.0])
-def test_factorisations_are_counted(beam, pull, counted, q):
+def test_factorisations_of_a_batch_are_all_counted(beam, pull, counted):
     problem = beam(NH)
-    solver, load = fem.Newton(problem, linear="superlu"), load_of(pull(problem, q))
+    load = load_of(torch.cat([pull(problem, q) for q in (5.0, 40.0, 160.0)]))
+    solver = fem.Newton(problem, linear="superlu")
     solver.linear_solver.factor  # noqa: B018  the scene's
     counted.clear()
     answer = fem.solve(solver, load)
-    assert 0 < answer.factorisations.item() == len(counted)
-    assert answer.factorisations.item() < answer.iterations.item() - 1
-
-
-@pytest.mark.parametrize("reuse", [0.01, 0.1, 0.5])
-def test_factors_are_reused_only_below_factor_reuse_tol(beam, pull, reuse):
-    problem = beam(NH)
-    solver = fem.Newton(problem, linear="superlu", factor_reuse_tol=reuse)
-    made, before = [], 1.0
-    for state in solver.iterate(load_of(pull(problem, 80.0))):
-        made.append((before, state.factorisations.item()))
-        before = state.residual.item()
-    new = [b - a for (_, a), (_, b) in pairwise(made)]
-    ratios = [ratio for ratio, _ in made[1:]]
-    assert all(n == 1 for n, ratio in zip(new[1:], ratios[1:], strict=True) if ratio >= reuse)
-    assert any(n == 0 for n, ratio in zip(new[1:], ratios[1:], strict=True) if ratio < reuse)
+    assert int(answer.factorisations.sum()) == len(counted)
+    assert (answer.factorisations > 0).all()
+    assert (answer.factorisations < answer.iterations - 1).all()
 
 
 def test_poor_preconditioner_is_replaced_after_the_largest_number_of_steps(
@@ -194,18 +175,14 @@ def test_poor_preconditioner_is_replaced_after_the_largest_number_of_steps(
 
 
 @pytest.mark.skipif("pardiso" not in fem.installed_backends(), reason="pardiso is not installed")
-def test_factorisations_of_a_batch_are_all_counted(beam, pull, monkeypatch):
-    calls, original = [], Pardiso._factorise
-
-    def count(self, matrix):
-        calls.append(1)
-        return original(self, matrix)
-
+def test_pardiso_factorises_no_tangent_of_a_batch_again(beam, pull, monkeypatch):
+    """It stores one factor at a time."""
+    calls, original = [], Pardiso.store_factor
     problem = beam(NH)
     load = load_of(torch.cat([pull(problem, q) for q in (5.0, 10.0, 20.0, 40.0)]))
     solver = fem.Newton(problem, linear="pardiso")
     solver.linear_solver.factor  # noqa: B018
-    monkeypatch.setattr(Pardiso, "_factorise", count)
+    monkeypatch.setattr(Pardiso, "store_factor", lambda *pair: calls.append(1) or original(*pair))
     assert int(fem.solve(solver, load).factorisations.sum()) == len(calls)
 
 
@@ -218,20 +195,20 @@ BODIES = {  # body with its unit load, critical load (independent code)
     "cube, nu = .45": (partial(cube, fem.NeoHookeanLn(0.45), 1, (0, 1, 2)), 0.7475041023),
     "cube, nu = .49": (partial(cube, fem.NeoHookeanLn(0.49), 1, (0, 1, 2)), 0.6804639956),
 }
-BEYOND = (1.0005, 1.002, 1.05)
 
 
 @pytest.mark.filterwarnings("ignore:linear .* lock")
 @pytest.mark.parametrize(
     ("name", "part", "linear", "reuse"),
     [
-        (name, part, "superlu", (0.0, 0.1, 1.0)[(row + number) % 3])
-        for row, name in enumerate(BODIES)
-        for number, part in enumerate(BEYOND)
-    ]
-    + [
-        ("SVK column", 1.001, linear, reuse)
-        for linear, reuse in (("band", 0.1), ("band32", 1.0), ("pardiso", 0.1))
+        *(("SVK column", 1.0005, "superlu", reuse) for reuse in (0.0, 0.1, 1.0)),
+        ("NH column", 1.0005, "superlu", 1.0),
+        ("NH column", 1.05, "superlu", 0.1),
+        ("cube, nu = .45", 1.0005, "superlu", 0.1),
+        ("cube, nu = .49", 1.002, "superlu", 0.0),
+        ("SVK column", 1.001, "band", 0.1),
+        ("SVK column", 1.001, "band32", 1.0),
+        ("SVK column", 1.001, "pardiso", 0.1),
     ],
 )
 def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, linear, reuse):

@@ -27,7 +27,6 @@ from dpl.fem.linear.banded import BandedFactor, MixedPrecisionFactor
 from dpl.fem.linear.ordering import band_storage
 from dpl.system.threads import slow_blas
 
-KNOWN = ["band", "band32", "pardiso", "superlu", "cg"]
 DIRECT = ["band", "band32", "pardiso", "superlu"]  # those that solve indefinite matrices too
 System = tuple[Pattern, np.ndarray]
 
@@ -40,22 +39,16 @@ class Structure(NamedTuple):
     indices: np.ndarray
 
 
-def need(name: str) -> str:
-    if name not in installed_backends():
-        pytest.skip(f"{name} is not installed")
-    return name
-
-
-@pytest.fixture(params=KNOWN)
+@pytest.fixture(params=installed_backends())
 def name(request) -> str:
     """Each installed backend."""
-    return need(request.param)
+    return request.param
 
 
-@pytest.fixture(params=DIRECT)
+@pytest.fixture(params=[name for name in DIRECT if name in installed_backends()])
 def direct(request) -> str:
     """Each installed backend that solves indefinite matrices."""
-    return need(request.param)
+    return request.param
 
 
 @pytest.fixture
@@ -75,10 +68,6 @@ def system(problem: Problem) -> System:
     """Return the tangent of a body at rest."""
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
     return problem.pattern, problem.tangent(rest)[0].numpy()
-
-
-def motions(problem: Problem) -> np.ndarray:
-    return problem.near_null
 
 
 @pytest.fixture(scope="module")
@@ -170,12 +159,12 @@ def test_conjugate_gradients_detect_indefinite_matrices(body):
     """By a solve with a random right-hand side, which has a component along every eigenvector."""
     pattern, values = system(body)
     eigenvalues = np.linalg.eigvalsh(full_matrix(pattern, values).toarray())
-    for near_null in (None, motions(body)):
+    for near_null in (None, body.near_null):
         solver = make_backend(pattern, "cg", near_null)
-        assert solver.factorise(values).stability() == 0
+        assert solver.factorise(values).stability == 0
         for count in (1, 3):
             moved = shifted(pattern, values, eigenvalues[count - 1] * 1.01)
-            assert solver.factorise(moved).stability() == 1
+            assert solver.factorise(moved).stability == 1
         with pytest.raises(SingularMatrix, match="not positive definite"):
             solver.factorise(moved).solve(np.ones(pattern.size))
 
@@ -231,14 +220,14 @@ def test_a_solve_changes_no_argument_and_takes_strides(name, stiffness):
     assert np.array_equal(values, kept)
 
 
-@pytest.mark.parametrize("entry", [np.nan, np.inf])
-def test_matrix_that_is_not_finite_is_an_error(name, stiffness, entry):
+def test_matrix_that_is_not_finite_is_an_error(name, stiffness):
     pattern, values = stiffness
-    broken = values.copy()
-    broken[7] = entry
     solver = make_backend(pattern, name)
-    with pytest.raises(SingularMatrix, match="finite"):
-        solver.factorise(broken)
+    for place, entry in ((7, np.nan), (7, np.inf), (0, np.nan), (0, np.inf)):
+        broken = values.copy()
+        broken[place] = entry
+        with pytest.raises(SingularMatrix, match="finite"):
+            solver.factorise(broken)
     assert error(solver, pattern, values) < 1e-10, "it solves the next one"
 
 
@@ -264,22 +253,12 @@ def test_singular_matrix_is_an_error(name, kind):
         attempt()
 
 
-@pytest.mark.parametrize("used", [False, True])
-def test_backend_survives_pickling(name, stiffness, used):
+def test_backend_survives_pickling_before_and_after_its_use(name, stiffness):
     pattern, values = stiffness
     solver = make_backend(pattern, name)
-    if used and name == "superlu":
-        solver._plan  # noqa: B018  the analysis
-    elif used:
-        solver.factorise(values)
-    assert error(pickle.loads(pickle.dumps(solver)), pattern, values) < 1e-10
-
-
-def maps(solver: Backend, pattern: Pattern, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a factor applies, and K, as full matrices (n, n)."""
-    factor = solver.factorise(values)
-    applied = np.stack([factor.apply(column) for column in np.eye(pattern.size)], axis=1)
-    return applied, full_matrix(pattern, values).toarray()
+    for _ in range(2):
+        solver = pickle.loads(pickle.dumps(solver))
+        assert error(solver, pattern, values) < 1e-10
 
 
 def needs_multigrid(name: str) -> None:
@@ -297,26 +276,27 @@ def test_applied_factor_is_symmetric_positive_definite_and_near_the_inverse(
 ):
     needs_multigrid(name)
     pattern, values = stiffness
-    applied, K = maps(make_backend(pattern, name, motions(body)), pattern, scale * values)
+    factor = make_backend(pattern, name, body.near_null).factorise(scale * values)
+    applied = np.stack([factor.apply(column) for column in np.eye(pattern.size)], axis=1)
     symmetric = (applied + applied.T) / 2
     rounding = 1e-5 if name == "band32" else 1e-12
     assert np.abs(applied - applied.T).max() < rounding * np.abs(applied).max()
     assert np.linalg.eigvalsh(symmetric)[0] > 0
-    root = np.linalg.cholesky(K)
+    root = np.linalg.cholesky(full_matrix(pattern, scale * values).toarray())
     spread = np.linalg.eigvalsh(root.T @ symmetric @ root)  # the eigenvalues of M K
     assert np.abs(spread - 1).max() < NEAR.get(name, 1e-8)
 
 
 def test_the_preconditioner_without_multigrid_is_the_diagonal(stiffness):
     pattern, values = stiffness
-    applied, K = maps(make_backend(pattern, "cg"), pattern, values)
-    assert np.allclose(applied, np.diag(1 / K.diagonal()), rtol=1e-14, atol=0)
+    applied = make_backend(pattern, "cg").factorise(values).apply(np.ones(pattern.size))
+    assert np.allclose(applied, 1 / values[pattern.indptr[:-1]], rtol=1e-14, atol=0)
 
 
 def test_applied_factor_is_a_fixed_linear_map(name, body, stiffness):
     """It depends on no solve or factorisation between, and does not change its argument."""
     pattern, values = stiffness
-    solver = make_backend(pattern, name, motions(body))
+    solver = make_backend(pattern, name, body.near_null)
     factor = solver.factorise(values)
     one, other = np.random.default_rng(0).normal(size=(2, pattern.size))
     kept, first = one.copy(), factor.apply(one)
@@ -329,35 +309,22 @@ def test_applied_factor_is_a_fixed_linear_map(name, body, stiffness):
     rounding = 1e-4 if name == "band32" else 1e-12
     assert np.abs(both - 2 * first + 3 * factor.apply(other)).max() < rounding * size
     assert not factor.apply(np.zeros(pattern.size)).any()
-
-
-@pytest.mark.parametrize("size", [1e-300, 1e100])
-def test_applied_factor_does_not_depend_on_the_size_of_the_right_hand_side(name, body, size):
-    pattern, values = system(body)
-    factor = make_backend(pattern, name, motions(body)).factorise(values)
-    right = np.random.default_rng(0).normal(size=pattern.size)
-    found, expected = factor.apply(size * right) / size, factor.apply(right)
-    assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
+    for scale in (1e-300, 1e100):
+        assert np.abs(factor.apply(scale * one) / scale - first).max() < 1e-5 * size
 
 
 def test_factor_of_a_near_tangent_is_a_preconditioner(name, body, stiffness, bend):
     """Conjugate gradients with the factor of another tangent take few steps."""
     needs_multigrid(name)
     pattern, values = stiffness
-    solver = make_backend(pattern, name, motions(body))
+    solver = make_backend(pattern, name, body.near_null)
     moved = 0.1 * bend(body.points) * body.points[:, :1]  # held where the body is
     other = body.tangent(moved)[0].numpy()
     assert np.abs(other - values).max() > 1e-3 * np.abs(values).max()
-    near, product, steps = solver.factorise(values), SymmetricProduct(pattern, other), []
-
-    def counted(x):
-        steps.append(1)
-        return product(x)
-
+    near, product = solver.factorise(values), SymmetricProduct(pattern, other)
     right = np.random.default_rng(0).normal(size=pattern.size)
-    x = conjugate_gradients(counted, near.apply, right, 1e-3, 100)
+    x = conjugate_gradients(product, near.apply, right, 1e-3, 25 if name == "cg" else 8)
     assert residual(pattern, other, x, right) < 1.01e-3
-    assert len(steps) <= (25 if name == "cg" else 8)
 
 
 def of_contrast(contrast: float) -> Problem:
@@ -367,7 +334,7 @@ def of_contrast(contrast: float) -> Problem:
     return Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), supports=[spring])
 
 
-@pytest.mark.parametrize("contrast", [1e-6, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("contrast", [1e-6, 1e9])
 def test_stiffnesses_far_apart_are_solved_to_rounding(direct, contrast):
     """Without iterative refinement."""
     pattern, values = system(of_contrast(contrast))
@@ -381,15 +348,15 @@ def test_stiffnesses_far_apart_are_solved_to_rounding(direct, contrast):
 # ---- bands
 
 
-@pytest.mark.parametrize("name", ["band", "band32"])
-def test_bandwidth_of_a_shuffled_mesh_is_reduced(name, shuffled):
+def test_bandwidth_of_a_shuffled_mesh_is_reduced(shuffled):
     pattern, values = system(shuffled)
     layout = band_storage(pattern)
     own = (pattern.indices - np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))).max()
     assert sorted(layout.order) == list(range(pattern.size))
     assert layout.half < own / 4
     assert layout.half <= 3 * 2 * 25  # two layers of nodes
-    assert error(make_backend(pattern, name), pattern, values) < 1e-10
+    for name in ("band", "band32"):
+        assert error(make_backend(pattern, name), pattern, values) < 1e-10
 
 
 def test_narrow_numbering_is_kept(stiffness):
@@ -429,7 +396,7 @@ def test_nearly_singular_matrix_is_solved_in_float64(smallest):
 @pytest.mark.parametrize("name", ["band32", "cg"])
 def test_iteration_stops_at_the_tolerance(name, shuffled, monkeypatch):
     pattern, values = system(shuffled)
-    factor = make_backend(pattern, name, motions(shuffled)).factorise(values)
+    factor = make_backend(pattern, name, shuffled.near_null).factorise(values)
     products, multiply = [], SymmetricProduct.__call__
 
     def counted(self, x):
@@ -458,32 +425,22 @@ def test_rigid_body_modes_have_no_energy(body):
     """On a body without supports."""
     free = Problem.build(box([100.0, 25.0, 25.0], [5, 3, 3]), NeoHookeanLn(0.3))
     pattern, values = system(free)
-    fields = motions(free)
+    fields = free.near_null
     assert np.linalg.matrix_rank(fields) == fields.shape[1] == 6
     forces = full_matrix(pattern, values) @ fields
     assert np.abs(forces).max() < 1e-12 * np.abs(values).max()
-    assert motions(body).shape == (system(body)[0].size, 6)
+    assert body.near_null.shape == (body.pattern.size, 6)
 
 
-def test_multigrid_iterations_hardly_grow_with_the_body(beam):
+def test_multigrid_takes_few_iterations_on_a_large_body(beam):
     """Smoothed aggregation, Vanek, Mandel, Brezina (1996)."""
     pytest.importorskip("pyamg")
-    steps = []
-    for cells in (12, 36):
-        problem = beam(NeoHookeanLn(0.3), cells, cells // 4)
-        pattern, values = system(problem)
-        factor = make_backend(pattern, "cg", motions(problem)).factorise(values)
-        right, count = np.random.default_rng(0).normal(size=pattern.size), []
-        x = conjugate_gradients(
-            lambda v, f=factor, c=count: c.append(1) or f.product(v),
-            factor.precondition,
-            right,
-            1e-8,
-            100,
-        )
-        assert residual(pattern, values, x, right) < 1e-7
-        steps.append(len(count))
-    assert steps[1] < 30
+    problem = beam(NeoHookeanLn(0.3), 32, 8)
+    pattern, values = system(problem)
+    factor = make_backend(pattern, "cg", problem.near_null).factorise(values)
+    right = np.random.default_rng(0).normal(size=pattern.size)
+    x = conjugate_gradients(factor.product, factor.precondition, right, 1e-8, 29)
+    assert residual(pattern, values, x, right) < 1e-7
 
 
 def test_multigrid_works_with_sliding_supports():
@@ -493,7 +450,7 @@ def test_multigrid_works_with_sliding_supports():
     held = mesh.p.T == 0  # each side slides on its plane
     problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=held)
     pattern, values = system(problem)
-    assert error(make_backend(pattern, "cg", motions(problem)), pattern, values) < 1e-10
+    assert error(make_backend(pattern, "cg", problem.near_null), pattern, values) < 1e-10
 
 
 def test_multigrid_draws_no_random_numbers(body):
@@ -505,7 +462,7 @@ def test_multigrid_draws_no_random_numbers(body):
     np.random.seed(3)  # noqa: NPY002
     right = np.ones(pattern.size)
     first, second = (
-        make_backend(pattern, "cg", motions(body)).factorise(values).solve(right) for _ in range(2)
+        make_backend(pattern, "cg", body.near_null).factorise(values).solve(right) for _ in range(2)
     )
     assert np.random.random() == expected  # noqa: NPY002
     assert np.array_equal(first, second)
@@ -514,7 +471,7 @@ def test_multigrid_draws_no_random_numbers(body):
 # ---- the choice
 
 
-SLENDER, LONG, WIDE = of_band(2000, 20), of_band(8000, 300), of_band(800, 400)
+SLENDER, LONG, WIDE = of_band(2000, 20), of_band(3200, 255), of_band(800, 400)
 FIELDS, PARDISO = np.ones((800, 6)), "pardiso" in installed_backends()
 NARROW = of_band(800, 40)
 NONE = ("pypardiso", "pyamg")

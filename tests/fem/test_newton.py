@@ -8,11 +8,11 @@ from itertools import pairwise, product
 
 import pytest
 import torch
-from solving import LENGTH, load_of, rest
+from solving import LENGTH, load_of, noise, rest
 from torch.testing import assert_close
 
 from dpl import fem
-from dpl.fem.linear import BACKENDS, SuperLU
+from dpl.fem.linear import SuperLU
 from dpl.fem.linear.banded import BandedCholesky
 from dpl.fem.solvers.factor_reuse import forcing_term
 
@@ -115,20 +115,6 @@ def test_residual_falls_with_the_second_order(beam, pull, law, q):
     assert math.log(c / b) / math.log(b / a) >= 1.9
 
 
-def test_one_step_squares_the_error(beam, pull):
-    """Half the error in the guess leaves a quarter of the error after one iteration."""
-    problem = beam(NH)
-    load = load_of(pull(problem, 20.0))
-    answer = fem.solve(newton(problem, tol=1e-12), load).displacement
-    left = []
-    for error in (1e-3, 5e-4, 2.5e-4):
-        states = newton(problem, mixed_integration=False).iterate(load, guess=(1 + error) * answer)
-        next(states)
-        left.append((next(states).displacement - answer).norm() / (error * answer.norm()))
-    assert left[0] < 0.1
-    assert [(a / b).item() for a, b in pairwise(left)] == pytest.approx([2.0, 2.0], rel=0.02)
-
-
 def test_no_load_costs_nothing(beam, monkeypatch):
     """Stress case T6: zero load, u = 0, 0 iterations, no factor."""
     problem = beam(NH)
@@ -141,12 +127,11 @@ def test_no_load_costs_nothing(beam, monkeypatch):
     assert states[0].load_factor.item() == 1
 
 
-@pytest.mark.parametrize("most", [3, 4])
-def test_a_load_step_is_at_most_twice_the_one_before(most):
+def test_a_load_step_is_at_most_twice_the_one_before():
     """With few iterations a step a load is applied in many; those that succeed are doubled."""
     problem = fem.Problem.build(fem.box([4.0, 1.0, 1.0], [9, 3, 3]), NH, fixed=fem.Plane(0, "min"))
     force = fem.Traction(fem.Plane(0, "max"), [0.0, 0.0, -2e-2]).on(problem)[None]
-    states = list(newton(problem, max_iter=most, mixed_integration=False).iterate(load_of(force)))
+    states = list(newton(problem, max_iter=4, mixed_integration=False).iterate(load_of(force)))
     assert states[-1].converged.all()
     factors = list(dict.fromkeys(state.load_factor.item() for state in states))
     parts = [b - a for a, b in pairwise(factors)]
@@ -203,31 +188,28 @@ def wrong(beam, pull) -> tuple[fem.Problem, fem.Load, fem.Solution]:
     return problem, load, fem.solve(newton(problem), load)
 
 
-@pytest.mark.parametrize("kind", ["nan", "one nan", "infinite", "inverted", "huge"])
+@pytest.mark.parametrize("kind", ["one nan", "infinite", "inverted", "huge"])
 def test_bad_guess_changes_no_bit_of_the_answer(wrong, kind):
     """Stress case T19."""
     problem, load, answer = wrong
     guess = torch.zeros_like(load.force)
-    if kind == "nan":
-        guess += math.nan
-    elif kind == "one nan":
+    if kind == "one nan":
         guess[0, -1, 1] = math.nan
-    elif kind == "infinite":
-        guess += math.inf
-    elif kind == "inverted":
-        guess += problem.points * torch.tensor([-1.5, 0, 0], dtype=torch.float64)
     else:
-        guess += 1e200 * torch.sin(1e3 * problem.points)
+        guess += {
+            "infinite": torch.tensor(math.inf),
+            "inverted": problem.points * torch.tensor([-1.5, 0, 0], dtype=torch.float64),
+            "huge": 1e200 * torch.sin(1e3 * problem.points),
+        }[kind]
     *_, again = newton(problem).iterate(load, guess=guess)
     assert differing(again, answer) == []
 
 
 def test_useless_but_uninverted_guess_still_ends_at_the_answer(wrong):
     problem, load, answer = wrong
-    random = torch.Generator().manual_seed(0)
-    noise = 5e-3 * torch.randn(load.force.shape, generator=random, dtype=torch.float64)
-    assert problem.volume_ratio(noise).item() > 0
-    for guess in (noise, -answer.displacement, 0.5 * answer.displacement):
+    small = 5e-3 * noise(*load.force.shape)
+    assert problem.volume_ratio(small).item() > 0
+    for guess in (small, -answer.displacement, 0.5 * answer.displacement):
         *_, end = newton(problem).iterate(load, guess=guess)
         assert end.converged.all()
         assert_close(end.displacement, answer.displacement, rtol=0, atol=1e-8)
@@ -236,16 +218,11 @@ def test_useless_but_uninverted_guess_still_ends_at_the_answer(wrong):
 def test_newton_takes_whole_steps_from_a_guess_or_gives_it_up(wrong):
     """A guess of which a step must be shortened is none: its steps solve the linearised system."""
     problem, load, answer = wrong
-    random = torch.Generator().manual_seed(0)
-    noise = torch.randn(load.force.shape, generator=random, dtype=torch.float64)
+    way = torch.where(problem.free, noise(*load.force.shape), 0.0)
     kept = given_up = 0
-    for size in (1e-4, 1e-3, 3e-3, 1e-2, 2e-2, 3e-2):
-        guess = answer.displacement + size * torch.where(problem.free, noise, 0.0)
-        states = list(
-            newton(problem, mixed_integration=False, factor_reuse_tol=0.0).iterate(
-                load, guess=guess
-            )
-        )
+    plain = newton(problem, mixed_integration=False, factor_reuse_tol=0.0)
+    for size in (1e-3, 3e-3, 1e-2, 3e-2):
+        states = list(plain.iterate(load, guess=answer.displacement + size * way))
         assert states[-1].converged.all()
         for state, end in pairwise(states):
             if not (state.from_guess and end.from_guess):
@@ -256,7 +233,7 @@ def test_newton_takes_whole_steps_from_a_guess_or_gives_it_up(wrong):
             after = before + problem.tangent_product(u, step)
             assert after[:, problem.free].norm() < 1e-2 * before.norm()
             kept += 1
-    assert kept > 10
+    assert kept > 6
     assert given_up > 0
 
 
@@ -273,18 +250,12 @@ def test_exact_guess_costs_nothing(wrong, monkeypatch):
     assert torch.equal(states[0].displacement, answer.displacement)
 
 
-def test_close_guess_saves_iterations(wrong):
+def test_close_guess_saves_iterations_and_its_held_nodes_are_not_believed(wrong):
     problem, load, answer = wrong
-    *_, end = newton(problem).iterate(load, guess=1.0001 * answer.displacement)
+    guess = 1.0001 * answer.displacement + torch.where(problem.free, 0.0, 0.1)
+    *_, end = newton(problem).iterate(load, guess=guess)
     assert end.converged.all()
     assert 0 < end.iterations.item() < answer.iterations.item()
-
-
-def test_guess_of_the_held_nodes_is_not_believed(wrong):
-    problem, load, answer = wrong
-    guess = answer.displacement + torch.where(problem.free, 0.0, 0.1)
-    *_, end = newton(problem).iterate(load, guess=guess)
-    assert end.iterations.item() == 0
     assert not end.displacement[:, ~problem.free].any()
 
 
@@ -299,28 +270,18 @@ def test_members_use_their_own_guess(beam, pull):
     assert end.iterations.tolist() == [0, answer.iterations[1].item(), 0]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda force: force.float(), "dtype"),
-        (lambda force: force.long(), "dtype"),
-        (lambda force: force[0], "shape"),
-        (lambda force: force[:, 1:], "shape"),
-        (lambda force: force[..., 1:], "shape"),
-        (lambda force: force[:0], "shape"),
-    ],
-    ids=["single", "whole", "no batch", "nodes", "axes", "none"],
-)
-def test_force_of_another_kind_or_shape_is_an_error_that_says_so(beam, pull, change, message):
+def test_force_of_another_kind_or_shape_is_an_error_that_says_so(beam, pull):
     problem = beam(NH, 2, 1)
-    solver, load = newton(problem), load_of(change(pull(problem, 20.0)))
-    for each in (solver, solver.linear_solver):
-        with pytest.raises(ValueError, match=rf"force\.{message} = "):
-            fem.solve(each, load)
+    force, solver = pull(problem, 20.0), newton(problem)
+    others = force[0], force[:, 1:], force[..., 1:], force[:0]
+    wrong = [("dtype", force.float()), ("dtype", force.long()), *(("shape", one) for one in others)]
+    for name, given in wrong:
+        for each in (solver, solver.linear_solver):
+            with pytest.raises(ValueError, match=rf"force\.{name} = "):
+                fem.solve(each, load_of(given))
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-@pytest.mark.parametrize("amplitude", [1e-12, 20.0])
+@pytest.mark.parametrize(("bad", "amplitude"), [(math.nan, 20.0), (math.inf, 1e-12)])
 def test_force_that_is_no_number_has_no_answer_even_on_a_held_node(beam, pull, bad, amplitude):
     problem = beam(NH, 2, 1)
     load = load_of(pull(problem, amplitude))
@@ -369,13 +330,10 @@ def test_load_whose_linear_answer_will_do_costs_no_factorisation(beam, pull, cou
     assert len(counted) == 1  # the rest state
 
 
-@pytest.mark.parametrize("name", [name for name in BACKENDS if name != "superlu"])
-def test_backends_give_the_same_answer(beam, pull, name):
-    if name not in fem.installed_backends():
-        pytest.skip(f"{name} is not installed")
-    problem = beam(NH)
-    load = load_of(pull(problem, 20.0))
-    first, second = (fem.solve(newton(problem, linear=one), load) for one in ("superlu", name))
+@pytest.mark.parametrize("name", sorted({*fem.installed_backends()} - {"superlu"}))
+def test_backends_give_the_same_answer(wrong, name):
+    problem, load, first = wrong
+    second = fem.solve(newton(problem, linear=name), load)
     assert second.converged.all()
     more = second.iterations.item() - first.iterations.item()  # iterative solves are less exact
     assert more == 0 or (name in ("band32", "cg") and abs(more) == 1)
@@ -444,23 +402,16 @@ def test_status_reads_as_words():
     assert [str(one) for one in fem.Status] == words
 
 
-@pytest.mark.parametrize("budget", [1, 3])
-def test_load_is_given_up_where_the_budget_ends(beam, pull, budget):
-    problem = beam(NH)
-    answer = fem.solve(newton(problem, max_total_iter=budget), load_of(pull(problem, 40.0)))
-    assert answer.status.item() == fem.Status.NOT_CONVERGED
-    assert answer.iterations.item() == budget
-    assert not answer.converged.any()
-    assert answer.load_factor.item() == 0
-
-
-def test_answer_of_the_last_iteration_of_the_budget_counts(beam, pull):
-    problem = beam(NH)
-    load = load_of(pull(problem, 20.0))
-    answer = fem.solve(newton(problem), load)
-    assert answer.converged.all()
-    spent = fem.solve(newton(problem, max_total_iter=answer.iterations.item()), load)
-    assert differing(spent, answer) == []
+def test_load_is_given_up_where_the_budget_ends_and_its_last_iteration_counts(wrong):
+    problem, load, whole = wrong
+    count = whole.iterations.item()
+    for budget in (1, count - 1):
+        answer = fem.solve(newton(problem, max_total_iter=budget), load)
+        assert answer.status.item() == fem.Status.NOT_CONVERGED
+        assert answer.iterations.item() == budget
+        assert not answer.converged.any()
+        assert answer.load_factor.item() == 0
+    assert differing(fem.solve(newton(problem, max_total_iter=count), load), whole) == []
 
 
 def test_linear_solves_are_as_exact_as_eisenstat_and_walker_ask():
@@ -502,7 +453,7 @@ def test_a_guess_with_an_indefinite_tangent_is_abandoned_if_wanted(linear, monke
     newton = fem.Newton(problem, linear=linear, abandon_indefinite_guess=True)
     if linear != "superlu":  # bands factorise no indefinite matrix themselves
         refused = property(lambda backend: pytest.fail("an indefinite tangent was factorised"))
-        monkeypatch.setattr(BandedCholesky, "other", refused)
+        monkeypatch.setattr(BandedCholesky, "indefinite", refused)
     states = list(newton.iterate(load, guess=guess))
     assert states[0].from_guess
     assert not states[1].from_guess

@@ -128,7 +128,10 @@ DOLFINX = {
 DOLFINX_ITERATIONS = [7, 8, 9, 8, 7, 6, 6, 5, 5]
 
 
-@pytest.mark.parametrize("degree", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("degree", "mixed"),
+    [(1, False), *(pytest.param(2, mixed, marks=pytest.mark.slow) for mixed in (False, True))],
+)
 def test_beam_of_the_dolfinx_tutorial_bends_as_computed(degree, mixed):
     """Beam of the dolfinx tutorial: nine loads, each from the previous solution, no load steps."""
     mesh = fem.box([20.0, 1.0, 1.0], [21, 6, 6])

@@ -9,14 +9,12 @@ from torch.testing import assert_close
 
 from dpl import fem
 from dpl.fem.rom.ecsw import cubature
-from dpl.fem.rom.pod import pod
+from dpl.fem.rom.pod import orthonormal_fields, pod
 
 
 def reduced(problem: fem.Problem, fields: torch.Tensor, rank: int) -> tuple[torch.Tensor, ...]:
     """Return an orthonormal basis of fields (S, N, D), (N, D, R), and their projections onto it."""
-    basis = pod(fields[:, problem.free], rank).vectors
-    vectors = torch.zeros(*problem.shape, rank, dtype=torch.float64)
-    vectors[problem.free] = basis
+    vectors = orthonormal_fields(pod(fields[:, problem.free], rank).vectors, problem.free)
     return vectors, torch.einsum("bnd,ndr,mer->bme", fields, vectors, vectors)
 
 
@@ -44,21 +42,19 @@ def test_vectors_of_small_singular_values_are_orthogonal():
         assert_close(vectors.T @ vectors, torch.eye(8, dtype=torch.float64), rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("rank", [0, -1, 8])
-def test_rank_out_of_range_is_refused(rank):
-    with pytest.raises(ValueError, match=f"rank = {rank} must lie between 1 and 7"):
-        pod(noise(7, 40), rank)
+def test_invalid_ranks_and_snapshots_are_refused(monkeypatch):
+    for rank in (0, -1, 8):
+        with pytest.raises(ValueError, match=f"rank = {rank} must lie between 1 and 7"):
+            pod(noise(7, 40), rank)
+    for large in (5, 2000):  # sketched and exact
+        monkeypatch.setattr("dpl.fem.rom.pod.MIN_SKETCH_SIZE", large)
+        with pytest.raises(ValueError, match="finite"):
+            pod(noise(150, 400).log(), 2)
 
 
-@pytest.mark.parametrize("large", [5, 2000], ids=["sketched", "exact"])
-def test_snapshots_that_are_not_finite_are_refused(monkeypatch, large):
-    monkeypatch.setattr("dpl.fem.rom.pod.MIN_SKETCH_SIZE", large)
-    with pytest.raises(ValueError, match="finite"):
-        pod(noise(150, 400).log(), 2)
-
-
-@pytest.mark.parametrize("shape", [(160, 400), (400, 160)], ids=str)
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [((160, 400), torch.float64), ((400, 160), torch.float32)], ids=str
+)
 def test_randomised_basis_is_nearly_the_best_one(monkeypatch, shape, dtype):
     fields = (noise(*shape) @ torch.diag(0.8 ** torch.arange(shape[1]).double())).to(dtype)
     best = pod(fields, 6)

@@ -11,6 +11,7 @@ from dpl.fem.linear.krylov import conjugate_gradients, conjugate_gradients_of_te
 from dpl.fem.solvers.parity_factor import OrbitForm, TermMatrices
 from dpl.fem.solvers.stiffness_terms import MAX_ERROR, StiffnessTerms
 
+FIXED, RANGED_LAW = NeoHookeanLn(0.3), NeoHookeanLn([0.2, 0.4])
 REGION = {"core": fem.Sphere([0.0, 0.0, 0.0], 0.7)}
 SPRINGS = [fem.RobinBC(fem.Plane(2, 0.0), 0.3)]
 FIBRES = fem.FibreReinforced(
@@ -27,20 +28,11 @@ def regions(core, other):
 LAWS = {  # and the number of terms
     "Poisson's ratio": (NeoHookeanLn([0.1, 0.45]), 2),
     "a stiff core": (regions(NeoHookeanLn(0.3, [1, 100]), NeoHookeanLn(0.4)), 2),
-    "moduli of Yeoh's law": (
-        regions(fem.YeohK2([0.1, 0.4], 0.0, 0.0, 3.0), NeoHookeanLn(0.3)),
-        2,
-    ),
-    "a core and Poisson's ratio": (
-        regions(NeoHookeanLn(0.3, young=[1, 50]), NeoHookeanLn([0.2, 0.4])),
-        3,
-    ),
-    "two Poisson's ratios": (
-        regions(NeoHookeanLn([0.1, 0.3], [1, 9]), NeoHookeanLn([0.2, 0.4])),
-        4,
-    ),
-    "fibres in an isotropic matrix": (regions(FIBRES, NeoHookeanLn(0.3)), 3),
-    "no range": (regions(NeoHookeanLn(0.3), NeoHookeanLn(0.3)), 1),
+    "moduli of Yeoh's law": (regions(fem.YeohK2([0.1, 0.4], 0.0, 0.0, 3.0), FIXED), 2),
+    "a core and Poisson's ratio": (regions(NeoHookeanLn(0.3, [1, 50]), RANGED_LAW), 3),
+    "two Poisson's ratios": (regions(NeoHookeanLn([0.1, 0.3], [1, 9]), RANGED_LAW), 4),
+    "fibres in an isotropic matrix": (regions(FIBRES, FIXED), 3),
+    "no range": (regions(FIXED, FIXED), 1),
     "one ratio of stiffnesses": (
         regions(NeoHookeanLn(0.3, [1, 9]), NeoHookeanLn(0.2, [1, 9])),
         2,

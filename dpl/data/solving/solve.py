@@ -108,7 +108,7 @@ def _solve_near(scene: Scene, load: Load, guess: Tensor) -> Solution | None:
     if not solution.converged:
         return None
     linear = newton.linear_solver.with_parameters(load.parameters)
-    value = linear.corotational.smallest_ritz_value(solution.displacement)
+    value = linear.smallest_ritz_value(solution.displacement)
     return solution if value > MIN_RITZ_VALUE else None
 
 

@@ -25,7 +25,11 @@ def installed_backends() -> list[str]:
 
 
 def make_backend(
-    pattern: Pattern, name: str | BackendFactory = "auto", near_null: Array | None = None
+    pattern: Pattern,
+    name: str | BackendFactory = "auto",
+    near_null: Array | None = None,
+    *,
+    many_rhs: bool = False,
 ) -> Backend:
     """Return a backend for matrices of a pattern.
 
@@ -35,11 +39,13 @@ def make_backend(
             function of `pattern` and `near_null` that returns a backend.
         near_null: Rigid body modes, (n, k), see `Problem.near_null`; "cg" needs them for
             multigrid.
+        many_rhs: Whether one factor solves for many right-hand sides: the factorisation may then
+            cost more if each solve costs less.
 
     Raises:
         ValueError: The backend is unknown or not installed.
     """
-    chosen = select_backend(name, pattern, near_null)
+    chosen = select_backend(name, pattern, near_null, many_rhs=many_rhs)
     make = BACKENDS[chosen] if isinstance(chosen, str) else chosen
     return make(pattern, near_null)
 
@@ -54,15 +60,8 @@ def select_backend(
     """Return the name of the backend, with "auto" replaced by the backend it selects.
 
     "auto" selects by the pattern and the installed packages, not by timings, so that results are
-    reproducible. Without a pattern it stays "auto". A function is returned as it is.
-
-    Args:
-        name, pattern, near_null: As for `make_backend`.
-        many_rhs: Whether one factor solves for many right-hand sides: the factorisation may then
-            cost more if each solve costs less.
-
-    Raises:
-        ValueError: The backend is unknown or not installed.
+    reproducible. Without a pattern it stays "auto". A function is returned as it is. Arguments and
+    errors are those of `make_backend`.
     """
     if callable(name):
         return name
@@ -70,7 +69,17 @@ def select_backend(
         raise ValueError(f"linear = {name!r} must be one of auto, {', '.join(BACKENDS)}")
     if name != "auto" and name not in installed_backends():
         raise ValueError(f"linear = {name!r} is not installed: {install(name)}")
-    return name if name != "auto" or pattern is None else _automatic(pattern, near_null, many_rhs)
+    if name != "auto" or pattern is None:
+        return name
+    best = sparse = _sparse_backend()
+    if near_null is not None and multigrid_installed():
+        large = MULTIGRID[sparse] * (MANY_RHS_FACTOR if many_rhs else 1)
+        best = "cg" if pattern.size > large else sparse
+    half = band_storage(pattern).half
+    if half**2 >= BAND_COST_RATIO[best] * pattern.size:
+        return best
+    # float32 makes the factorisation faster, but not a solve to full accuracy
+    return "band32" if half >= FLOAT32_BANDWIDTH and not many_rhs else "band"
 
 
 # A banded factorisation takes n b^2 operations, a sparse one of a solid about n^2 slower ones, so
@@ -81,31 +90,19 @@ MANY_RHS_FACTOR = 3.0  # multiplies MULTIGRID if one factor solves for many righ
 FLOAT32_BANDWIDTH = 250  # b from which float32 saves more than its iterations cost
 
 
-def _automatic(pattern: Pattern, near_null: Array | None, many_rhs: bool) -> str:
-    names = installed_backends()
-    sparse = "pardiso" if "pardiso" in names else "superlu"
-    multigrid = "cg" in names and near_null is not None and multigrid_installed()
-    large = MULTIGRID[sparse] * (MANY_RHS_FACTOR if many_rhs else 1)
-    best = "cg" if multigrid and pattern.size > large else sparse
-    if "band" in names:
-        half = band_storage(pattern).half
-        if half**2 < BAND_COST_RATIO[best] * pattern.size:
-            # float32 makes the factorisation faster, but not a solve to full accuracy
-            return "band32" if half >= FLOAT32_BANDWIDTH and not many_rhs else "band"
-    return best
+def _sparse_backend() -> str:
+    """Return the name of the best sparse direct solver, which takes indefinite matrices too."""
+    return "pardiso" if "pardiso" in installed_backends() else "superlu"
 
 
 def factorisation_work(pattern: Pattern) -> float:
     """Return the multiply-adds of a banded factorisation that takes as long as that of "auto"."""
-    sparse = "pardiso" if "pardiso" in installed_backends() else "superlu"
-    return pattern.size * min(
-        float(band_storage(pattern).half) ** 2, BAND_COST_RATIO[sparse] * pattern.size
-    )
+    half, size = float(band_storage(pattern).half), pattern.size
+    return size * min(half**2, BAND_COST_RATIO[_sparse_backend()] * size)
 
 
 def _indefinite(pattern: Pattern) -> Backend:
-    """Return the best backend for matrices that are not positive definite."""
-    return Pardiso(pattern) if "pardiso" in installed_backends() else SuperLU(pattern)
+    return BACKENDS[_sparse_backend()](pattern, None)
 
 
 BACKENDS: dict[str, BackendFactory] = {

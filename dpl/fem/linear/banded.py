@@ -1,7 +1,7 @@
 """Banded Cholesky factors by LAPACK, the fastest direct solver for slender bodies."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -28,14 +28,10 @@ MAX_ITER = 25  # of conjugate gradients; more cost more than a float64 factor
 
 
 def banded_block_solve(L: NDArray[Any], x: NDArray[Any]) -> None:
-    """Replace x (n, k) by the solution of L L^T x = right-hand sides, k at once.
+    """Replace right-hand sides x (n, k) by the solutions of L L^T x = right, k at once.
 
-    Blocks of columns of L become dense matrices, so that matrix products do the work and L is read
-    once for all right-hand sides.
-
-    Args:
-        L: Storage of the factor, (n, b + 1), see `BandedFactor`; zero beyond the last row.
-        x: Right-hand sides, (n, k), of the same dtype.
+    Blocks of columns of the factor L (n, b + 1), see `BandedFactor`, become dense matrices, so that
+    matrix products do the work and L is read once. L is zero beyond the last row.
     """
     n, width = L.shape
     starts = range(0, n, BLOCK)
@@ -54,11 +50,7 @@ def banded_block_solve(L: NDArray[Any], x: NDArray[Any]) -> None:
 
 
 def _dense_columns(L: NDArray[Any]) -> NDArray[Any]:
-    """Return m columns of a factor as dense rows, (m, m + b), the first m of them triangular.
-
-    Args:
-        L: Storage of these columns, (m, b + 1).
-    """
+    """Return m columns of a factor (m, b + 1) as rows, (m, m + b), the first m triangular."""
     m, width = L.shape
     padded = np.zeros((m, width + m), L.dtype)
     padded[:, :width] = L
@@ -68,20 +60,14 @@ def _dense_columns(L: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class BandedFactor(Factor):
-    """Banded Cholesky factor L of a positive definite matrix.
+    """Banded Cholesky factor L of a positive definite matrix."""
 
-    Attributes:
-        storage: L, (n, b + 1), see `BandStorage`.
-        order: Order of the unknowns, see `BandStorage`.
-        negative_pivots: 0.
-    """
-
-    storage: NDArray[Any]
-    order: NDArray[np.int32] | None
+    storage: NDArray[Any]  # L, (n, b + 1), see `BandStorage`
+    order: NDArray[np.int32] | None  # order of the unknowns, see `BandStorage`
     negative_pivots: int = 0
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
-        """Return x, (n,), with K x = right, to the rounding of the storage."""
+        """Return x, (n,), to the rounding of the storage, see `Factor.solve`."""
         order = slice(None) if self.order is None else self.order
         ordered = np.ascontiguousarray(right[order], self.storage.dtype)
         solve = dpbtrs if self.storage.dtype == np.float64 else spbtrs
@@ -100,10 +86,6 @@ class BandedFactor(Factor):
         x[:, order] = ordered.T
         return x * size
 
-    def to_float32(self) -> "BandedFactor":
-        """Return the factor in float32, in half the memory."""
-        return replace(self, storage=self.storage.astype(np.float32))
-
 
 class BandedCholesky:
     """Banded Cholesky in float64; another backend factorises indefinite matrices.
@@ -115,7 +97,7 @@ class BandedCholesky:
 
     def __init__(self, pattern: Pattern, indefinite: Callable[[Pattern], Backend]) -> None:
         """Store the pattern, and a constructor of a backend for indefinite matrices."""
-        self.pattern, self.indefinite = pattern, indefinite
+        self.pattern, self._make_indefinite = pattern, indefinite
 
     @cached_property
     def layout(self) -> BandStorage:
@@ -123,27 +105,17 @@ class BandedCholesky:
         return band_storage(self.pattern)
 
     @cached_property
-    def other(self) -> Backend:
+    def indefinite(self) -> Backend:
         """The backend for matrices that are not positive definite."""
-        return self.indefinite(self.pattern)
+        return self._make_indefinite(self.pattern)
 
     def factorise(self, values: Array) -> Factor:
         """Return the factor, see `Backend.factorise`."""
-        return self._definite(values) or self.other.factorise(values)
+        return self.definite(values) or self.indefinite.factorise(values)
 
-    def factorise_definite(self, values: Array) -> Factor:
-        """Return the factor of a positive definite matrix, see `Backend`."""
-        if (factor := self._definite(values)) is None:
-            raise SingularMatrix("the matrix is not positive definite")
-        return factor
-
-    def _definite(self, values: Array) -> Factor | None:
-        """Return the factor; None if the matrix may not be positive definite."""
+    def definite(self, values: Array) -> Factor | None:
+        """Return the factor; None if the matrix may not be positive definite, see `Backend`."""
         require_finite(values)
-        return self._cholesky(values)
-
-    def _cholesky(self, values: Array) -> BandedFactor | None:
-        """Return the factor; None if the matrix may not be positive definite."""
         layout = self.layout
         storage = np.zeros((self.pattern.size, layout.half + 1), self.dtype)
         storage.ravel()[layout.place] = values.astype(self.dtype, copy=False)
@@ -166,46 +138,33 @@ class MixedPrecisionBandedCholesky(BandedCholesky):
     dtype = np.float32
 
     @cached_property
-    def other(self) -> BandedCholesky:
+    def exact(self) -> BandedCholesky:
         """Backend in float64."""
-        exact = BandedCholesky(self.pattern, self.indefinite)
+        exact = BandedCholesky(self.pattern, self._make_indefinite)
         exact.layout = self.layout
         return exact
 
-    def factorise_definite(self, values: Array) -> Factor:
-        """Return the factor of a positive definite matrix, see `Backend`."""
-        return self._definite(values) or self.other.factorise_definite(values)
-
-    def _definite(self, values: Array) -> Factor | None:
-        require_finite(values)
+    def definite(self, values: Array) -> Factor | None:
+        """Return the factor; None if the matrix may not be positive definite, see `Backend`."""
         diagonal = np.abs(values[self.pattern.indptr[:-1]])
         scale = float(np.sqrt(diagonal.max(initial=0)) * np.sqrt(diagonal.min(initial=np.inf)))
-        if not 0 < scale < np.inf:
-            return None
-        with np.errstate(over="ignore"):
-            rough = self._cholesky(values / scale)
-        if rough is None:
-            return None
-        return MixedPrecisionFactor(self, values.copy(), rough, scale)
+        if 0 < scale < np.inf:
+            with np.errstate(over="ignore"):
+                rough = super().definite(values / scale)
+            if rough is not None:
+                return MixedPrecisionFactor(self, values.copy(), rough, scale)
+        return self.exact.definite(values)
 
 
 @dataclass(eq=False)
 class MixedPrecisionFactor(Factor):
-    """A matrix with its factor in float32, and one in float64 after a solve that needed it.
+    """A matrix with its factor in float32, and one in float64 after a solve that needed it."""
 
-    Attributes:
-        parent: The backend.
-        values: Entries of the matrix, (nnz,).
-        rough: Factor of the entries over `scale`.
-        scale: Size of the entries.
-        exact: Factor in float64, once needed.
-    """
-
-    parent: MixedPrecisionBandedCholesky
-    values: Array
-    rough: BandedFactor
-    scale: float
-    exact: Factor | None = None
+    parent: MixedPrecisionBandedCholesky  # the backend
+    values: Array  # entries of the matrix, (nnz,)
+    rough: Factor  # factor of the entries over `scale`
+    scale: float  # size of the entries
+    exact: Factor | None = None  # factor in float64, once needed
 
     @cached_property
     def product(self) -> SymmetricProduct:
@@ -213,9 +172,9 @@ class MixedPrecisionFactor(Factor):
         return SymmetricProduct(self.parent.pattern, self.values)
 
     @property
-    def negative_pivots(self) -> int:
+    def negative_pivots(self) -> int | None:
         """Negative pivots of the float64 factor, 0 while there is none."""
-        return 0 if self.exact is None else self.exact.negative_pivots or 0
+        return 0 if self.exact is None else self.exact.negative_pivots
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), see `Factor.solve`."""
@@ -223,7 +182,8 @@ class MixedPrecisionFactor(Factor):
             try:
                 return conjugate_gradients(self.product, self.apply, right, rtol, MAX_ITER)
             except SingularMatrix:
-                self.exact = self.parent.other.factorise(self.values)
+                definite = self.parent.exact.definite(self.values)
+                self.exact = definite or self.parent.indefinite.factorise(self.values)
         return self.exact.solve(right)
 
     def apply(self, right: Array) -> Array:

@@ -1,7 +1,9 @@
 """Solution by nested static condensation: dense blocks instead of triangular factors.
 
-The unknowns of a front are condensed as the interior of a substructure is: with F the matrix of the
-front after the elimination of its children, I its pivots and J its boundary,
+Nested dissection divides a sparse symmetric matrix into a tree of parts that separators make
+independent. The unknowns of a part, a front, are condensed as the interior of a substructure is:
+with F the matrix of the front after the elimination of its children, I its pivots and J its
+boundary,
 
     forward, children first:  g = F_II^-1 f_I,   f_J <- f_J - X^T f_I,   X = F_II^-1 F_IJ
     backward, parents first:  u_I = g - X u_J
@@ -9,8 +11,9 @@ front after the elimination of its children, I its pivots and J its boundary,
 The blocks are stored as they are multiplied, so that a solution consists of products of dense
 matrices and vectors. A front without forces below it is left out of the forward pass.
 
-Sources: Guyan (1965), AIAA J. 3 (static condensation); George (1973) and Duff, Reid (1983), see
-`dpl.fem.linear.dissection`.
+Sources: George (1973), Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10;
+Duff, Reid (1983), The multifrontal solution of indefinite sparse symmetric linear equations, ACM
+Trans. Math. Softw. 9 (fronts); Guyan (1965), AIAA J. 3 (static condensation).
 """
 
 from collections.abc import Sequence
@@ -21,46 +24,117 @@ import torch
 from numba import float32, float64, int64, njit, void
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dpl.fem.linear.dissection import Integers, nested_dissection
 from dpl.fem.linear.interface import SingularMatrix
+
+Integers = NDArray[np.int64]
+
+LEAF = 64  # unknowns of a part that is not divided further
+SMALLEST_SIDE = 0.05  # of the unknowns of a part
+SAME = 1e-9  # difference of coordinates, over the size of the body, of one layer
+
+
+class Front(NamedTuple):
+    """Unknowns that are eliminated together, ascending.
+
+    The boundary are unknowns that are eliminated later and are coupled to the pivots, directly or
+    by earlier eliminations.
+    """
+
+    pivots: Integers  # the eliminated unknowns, (I,)
+    boundary: Integers  # (J,)
+    children: tuple[int, ...]  # numbers of the fronts whose boundaries begin here
+
+
+def nested_dissection(graph: csr_array, points: NDArray[np.float64]) -> list[Front]:
+    """Return the fronts of a matrix, children before their parents.
+
+    The graph is a symmetric matrix with positive entries where unknowns are coupled, (n, n). The
+    points (n, D) are the positions of the unknowns.
+    """
+    fronts: list[Front] = []
+    _dissect(graph, points, np.arange(graph.shape[0]), fronts)
+    pivots = np.concatenate([front.pivots for front in fronts])
+    rank = np.empty_like(pivots)
+    rank[pivots] = np.arange(len(pivots))
+    for k, front in enumerate(fronts):
+        later = [fronts[child].boundary for child in front.children]
+        coupled = np.unique(np.concatenate([graph[front.pivots].indices, *later]))
+        boundary = coupled[rank[coupled] > rank[front.pivots].max()]
+        fronts[k] = front._replace(boundary=boundary.astype(np.int64))
+    return fronts
+
+
+def _dissect(
+    graph: csr_array, points: NDArray[np.float64], unknowns: Integers, fronts: list[Front]
+) -> tuple[int, ...]:
+    """Append the fronts of some unknowns and return the numbers of the last ones, the roots."""
+    if not len(unknowns):
+        return ()
+    own = graph[unknowns][:, unknowns]
+    count, part = connected_components(own, directed=False)
+    if count > 1:
+        pieces = (unknowns[part == k] for k in range(count))
+        return tuple(root for one in pieces for root in _dissect(graph, points, one, fronts))
+    side = _divide(own, points[unknowns]) if len(unknowns) > LEAF else None
+    children: tuple[int, ...] = ()
+    if side is not None:
+        for k in (-1, 1):
+            children += _dissect(graph, points, unknowns[side == k], fronts)
+        unknowns = unknowns[side == 0]
+    fronts.append(Front(unknowns, unknowns[:0], children))
+    return (len(fronts) - 1,)
+
+
+def _divide(graph: csr_array, points: NDArray[np.float64]) -> NDArray[np.int8] | None:
+    """Return the side of each unknown, -1 or 1, and 0 in the smallest separator; None without one.
+
+    Both sides have at least `SMALLEST_SIDE` of the unknowns. They are divided at the median of a
+    coordinate or of the layers of neighbours.
+    """
+    best = None
+    start = int(dijkstra(graph, unweighted=True, indices=0).argmax())
+    for key in (*points.T, dijkstra(graph, unweighted=True, indices=start)):
+        middle = np.partition(key, len(key) // 2)[len(key) // 2]
+        left = key < middle - SAME
+        towards_right = ~left & (graph @ left.astype(float) > 0)
+        towards_left = left & (graph @ (~left).astype(float) > 0)
+        for separator in (towards_right, towards_left):
+            side = np.where(separator, 0, np.where(left, -1, 1)).astype(np.int8)
+            least = min((side == -1).sum(), (side == 1).sum())
+            smaller = best is None or separator.sum() < (best == 0).sum()
+            if smaller and least >= SMALLEST_SIDE * len(side):
+                best = side
+    return best
 
 
 class Fronts(NamedTuple):
     """Fronts of a matrix, children before their parents, as arrays.
 
-    Attributes:
-        table: First and last position of the pivots among the unknowns, last position of the
-            boundary, and position of the blocks among the values of each front, (S, 4).
-        unknowns: Pivots and boundary of one front after the other, (T,).
-        heights: 0 of fronts without children, else one more than the largest of theirs, (S,).
+    A row of the table has the first and last position of the pivots among the unknowns, the last
+    position of the boundary, and the position of the blocks among the values.
     """
 
-    table: Integers
-    unknowns: Integers
-    heights: Integers
+    table: Integers  # (S, 4)
+    unknowns: Integers  # pivots and boundary of one front after the other, (T,)
+    heights: Integers  # 0 without children, else one more than the largest of theirs, (S,)
 
 
 class Condensed(NamedTuple):
-    """Blocks of P matrices with the same fronts.
+    """Blocks of P matrices with the same fronts."""
 
-    Attributes:
-        fronts: The fronts.
-        values: F_II^-1 and X of one front after the other, row by row, (P, V).
-    """
-
-    fronts: Fronts
-    values: NDArray[Any]
+    fronts: Fronts  # the fronts
+    values: NDArray[Any]  # F_II^-1 and X of one front after the other, row by row, (P, V)
 
 
 def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Condensed:
-    """Return the blocks in float64 of symmetric positive definite matrices.
+    """Return the blocks in float64 of P symmetric positive definite matrices, (n, n).
 
-    Args:
-        matrices: P matrices, (n, n), of similar structure.
-        points: Position of each unknown, by which the fronts are chosen, (n, D).
+    The matrices have a similar structure. The fronts are chosen by the points, (n, D), the
+    positions of the unknowns.
 
     Raises:
         SingularMatrix: A matrix is not positive definite.
@@ -81,7 +155,11 @@ def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Cond
             where = np.array([position[j] for j in tree[child].boundary.tolist()], np.int64)
             F[:, where[:, None], where] += updates.pop(child)
             heights[k] = max(heights[k], heights[child] + 1)
-        inverse = _inverse(F[:, :count, :count])
+        try:
+            roots = np.linalg.inv(np.linalg.cholesky(F[:, :count, :count]))
+        except np.linalg.LinAlgError as error:
+            raise SingularMatrix("the matrix is not positive definite") from error
+        inverse = roots.mT @ roots  # exactly symmetric
         X = inverse @ F[:, :count, count:]
         updates[k] = F[:, count:, count:] - F[:, count:, :count] @ X
         table.append((first, first + count, first + len(both), place))
@@ -90,15 +168,6 @@ def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Cond
     unknowns = np.concatenate([part for front in tree for part in front[:2]])
     fronts = Fronts(np.array(table), unknowns, heights)
     return Condensed(fronts, np.concatenate(blocks, axis=1))
-
-
-def _inverse(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return inverses, (P, I, I), exactly symmetric."""
-    try:
-        roots = np.linalg.inv(np.linalg.cholesky(matrices))
-    except np.linalg.LinAlgError as error:
-        raise SingularMatrix("the matrix is not positive definite") from error
-    return np.asarray(roots.mT @ roots)
 
 
 @njit(fastmath=True)
@@ -119,15 +188,6 @@ def add_product(x, A, y):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=True)
-def dot(x, row):  # type: ignore[no-untyped-def]
-    """Return the product of a vector (F,) and a row (F,), in the type of the vector."""
-    total = x.dtype.type(0)
-    for j in range(len(x)):
-        total += x[j] * row[j]
-    return total
-
-
-@njit(fastmath=True)
 def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
     """Subtract A x from y, (F,), for A (F, R) and x (R,); x is read once for four rows."""
     n = A.shape[1]
@@ -145,20 +205,16 @@ def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
         y[i + 3] -= d
         i += 4
     while i < len(y):
-        y[i] -= dot(x, A[i])
+        a = x.dtype.type(0)
+        for j in range(n):
+            a += A[i, j] * x[j]
+        y[i] -= a
         i += 1
 
 
 @njit
 def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[no-untyped-def]
-    """Set `solution` (n,) to K^-1 f.
-
-    Args:
-        table, unknowns: See `Fronts`.
-        values: Blocks of one matrix, (V,).
-        force: f, (n,), in float64 or in the type of the blocks; overwritten.
-        solution: (n,), in the type of the force.
-    """
+    """Set `solution` (n,) to that of one matrix, see `condensed_solves`."""
     work, dtype = np.zeros_like(force), force.dtype
     for s in range(len(table)):
         first, middle, last, place = table[s]
@@ -205,13 +261,10 @@ def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[n
     cache=True,
 )
 def condensed_solves(table, unknowns, values, forces, solutions):  # type: ignore[no-untyped-def]
-    """Set `solutions` (P, n) to those of P matrices, one force (P, n) each.
+    """Set `solutions` (P, n) to those of P matrices, one force (P, n) each, of the same type.
 
-    Args:
-        table, unknowns: See `Fronts`.
-        values: Blocks of the matrices, (P, V).
-        forces: The forces, in float64 or in the type of the blocks; overwritten.
-        solutions: (P, n), in the type of the forces.
+    The forces are in float64 or in the type of the blocks and are overwritten. For table, unknowns
+    and values, (P, V), see `Fronts` and `Condensed`.
     """
     for p in range(len(values)):
         if (forces[p] != 0.0).any():
@@ -221,19 +274,12 @@ def condensed_solves(table, unknowns, values, forces, solutions):  # type: ignor
 
 
 class Layer(NamedTuple):
-    """Fronts of the same height and similar sizes, filled to one size; none depends on another.
+    """Fronts of the same height and similar sizes, filled to one size; none depends on another."""
 
-    Attributes:
-        pivots: Pivots of each front, n where there are fewer, (k, I).
-        boundary: Their boundaries, n where there are fewer, (k, J).
-        inverse: F_II^-1 of P matrices, zero in filled rows and columns, (P, k, I, I).
-        coupling: X, (P, k, I, J).
-    """
-
-    pivots: Tensor
-    boundary: Tensor
-    inverse: Tensor
-    coupling: Tensor
+    pivots: Tensor  # pivots of each front, n where there are fewer, (k, I)
+    boundary: Tensor  # their boundaries, n where there are fewer, (k, J)
+    inverse: Tensor  # F_II^-1 of P matrices, zero in filled rows and columns, (P, k, I, I)
+    coupling: Tensor  # X, (P, k, I, J)
 
 
 def condensed_layers(blocks: Condensed, device: torch.device | str) -> list[Layer]:

@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, triu
 
 Array = NDArray[np.float64]
 
@@ -47,8 +47,9 @@ class Factor(ABC):
         """Number of negative eigenvalues; None where the backend does not count them."""
         return None
 
+    @property
     def stability(self) -> int:
-        """Return the number of negative eigenvalues; 1 for any number, `UNKNOWN` for no knowledge.
+        """Number of negative eigenvalues; 1 for any number, `UNKNOWN` for no knowledge.
 
         Iterative backends may need a linear solve for it.
         """
@@ -62,28 +63,20 @@ class Factor(ABC):
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right.
 
-        Args:
-            right: Right-hand side, (n,).
-            rtol: ||right - K x|| / ||right|| at which iterative backends stop [-]; direct ones
-                solve to rounding.
-
-        Raises:
-            SingularMatrix: An iterative backend found negative curvature or did not converge.
+        Iterative backends stop at ||right - K x|| <= rtol ||right||, and raise a `SingularMatrix`
+        if they find negative curvature or do not converge. Direct ones solve to rounding.
         """
 
     def solve_many(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return the solutions, (k, n), of right-hand sides (k, n), see `solve`."""
-        solutions = np.empty_like(right)
-        for row, one in zip(solutions, right, strict=True):
-            row[:] = self.solve(one, rtol)
-        return solutions
+        return np.array([self.solve(row, rtol) for row in right]).reshape(right.shape)
 
 
 class Backend(Protocol):
     """Factorisation of matrices of one pattern, on one thread. Pickling omits the factors.
 
-    A backend that refuses indefinite matrices at less cost than it factorises them has a method
-    `factorise_definite`, which raises `SingularMatrix` for them.
+    A backend that detects indefinite matrices at less cost than it factorises them has a method
+    `definite`, which returns the factor, or None if the matrix may not be positive definite.
     """
 
     def factorise(self, values: Array) -> Factor:
@@ -101,8 +94,8 @@ class SymmetricProduct:
 
     def __init__(self, pattern: Pattern, values: Array) -> None:
         """Store the entries (nnz,) without a copy."""
-        shape = (pattern.size, pattern.size)
-        self.upper = csr_array((values, pattern.indices, pattern.indptr), shape=shape)
+        entries = values, pattern.indices, pattern.indptr
+        self.upper = csr_array(entries, shape=(pattern.size,) * 2)
         self.lower = self.upper.T  # a view
         self.diagonal = values[pattern.indptr[:-1]]
 
@@ -117,10 +110,7 @@ class SymmetricProduct:
 def full_matrix(pattern: Pattern, values: Array) -> csr_array:
     """Return the full symmetric matrix (n, n) of upper-triangle entries (nnz,)."""
     upper = csr_array((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
-    lower = upper.T.tocsr()
-    lower.setdiag(0)
-    lower.eliminate_zeros()
-    return (upper + lower).tocsr()
+    return (upper + triu(upper, 1).T).tocsr()
 
 
 def row_numbers(pattern: Pattern) -> NDArray[np.int32]:

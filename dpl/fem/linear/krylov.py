@@ -57,11 +57,10 @@ def conjugate_gradients(
     for Sparse Linear Systems, algorithm 9.1.
 
     Args:
-        product: Function x -> K x.
-        precondition: Function r -> M^-1 r, symmetric positive definite, near K^-1 r.
-        right: Right-hand side, (n,).
-        rtol: Relative residual at which to stop [-].
-        max_iter: Largest number of iterations.
+        product, precondition: Functions x -> K x and r -> M^-1 r. M is symmetric positive definite
+            and near K.
+        right, rtol, max_iter: Right-hand side (n,), relative residual and number of iterations at
+            which to stop.
         abort_if_slow: Stop after three or more iterations if the residual, at its mean rate of
             convergence, would not reach `rtol` within `max_iter`.
         natural: Take the norm sqrt(r . M^-1 r) instead of the Euclidean norm.
@@ -94,15 +93,9 @@ def conjugate_gradients_of_tensors(
 ) -> Tensor:
     """Return x, (..., n), with K x = f for a batch, as tensor operations.
 
-    Systems whose residual is below `rtol` are left as they are. An exported graph contains the step
-    once, in a loop.
-
-    Args:
-        product: Function x -> K x, (..., n).
-        precondition: Function r -> M^-1 r, (..., n), symmetric positive definite.
-        right: f, (..., n).
-        rtol: Norm sqrt(r . M^-1 r) of the residual over that of f at which to stop [-].
-        max_steps: Largest number of steps.
+    Arguments are those of `conjugate_gradients` with its norm `natural`. Systems whose residual is
+    below `rtol` are left as they are, and `max_steps` may be too few. An exported graph contains
+    the step once, in a loop.
     """
     size = right.abs().amax(dim=-1, keepdim=True)  # squares of a scaled force do not overflow
     size = torch.where(size > 0, size, 1.0)
@@ -151,11 +144,9 @@ def solve_unsymmetric(
 
     Args:
         pattern: Upper triangle of K.
-        symmetric: Entries of (K + K^T) / 2 on it, (nnz,).
-        skew: Entries of (K - K^T) / 2, (nnz,); the negative ones solve with K^T.
-        precondition: Function r -> M^-1 r, linear, near K^-1 r.
-        right: Right-hand side, (n,).
-        rtol: Relative residual at which to stop [-].
+        symmetric, skew: Entries of (K + K^T) / 2 and of (K - K^T) / 2 on it, (nnz,); -skew solves
+            with K^T.
+        precondition, right, rtol: As of `conjugate_gradients`; M need not be symmetric.
         max_steps: Largest number of steps in a cycle, and of stored vectors.
 
     Raises:
@@ -172,8 +163,7 @@ def solve_unsymmetric(
     )
     if failed or not np.isfinite(x).all():
         raise SingularMatrix(f"no convergence to {rtol:g} in {max_steps} GMRES steps")
-    found: Array = x
-    return found
+    return np.asarray(x)
 
 
 def binary_unit(vector: Array) -> float:
@@ -182,35 +172,15 @@ def binary_unit(vector: Array) -> float:
     return float(2.0 ** np.clip(np.frexp(largest)[1], -1021, 1023))
 
 
-def scaled_norm(vector: Array) -> float:
-    """Return the Euclidean norm, without overflow or underflow of squares."""
-    with np.errstate(over="ignore"):
-        size = float(np.linalg.norm(vector))
-    if 1e-140 < size < 1e140:
-        return size
-    largest = float(np.abs(vector).max(initial=0))
-    if not 0 < largest < math.inf:
-        return largest
-    return largest * float(np.linalg.norm(vector / largest))
-
-
 @dataclass(eq=False)
 class KrylovState:
-    """State of conjugate gradients, valid until the next step.
+    """State of conjugate gradients, valid until the next step."""
 
-    Attributes:
-        solution: x, (n,).
-        residual: right - K x, (n,).
-        precondition: As of `conjugate_gradients`.
-        lanczos: Diagonal and off-diagonal of the tridiagonal matrix of the steps.
-        is_definite: False after a direction of negative curvature.
-    """
-
-    solution: Array
-    residual: Array
-    precondition: Map
-    lanczos: tuple[list[float], list[float]]
-    is_definite: bool = True
+    solution: Array  # x, (n,)
+    residual: Array  # right - K x, (n,)
+    precondition: Map  # as of `conjugate_gradients`
+    lanczos: tuple[list[float], list[float]]  # (off-)diagonal of the tridiagonal matrix of steps
+    is_definite: bool = True  # false after a direction of negative curvature
 
     @cached_property
     def preconditioned(self) -> Array:
@@ -235,12 +205,9 @@ def krylov_steps(product: Map, precondition: Map, right: Array) -> Iterator[Kryl
     Source: Saad (2003), Iterative Methods for Sparse Linear Systems, section 6.7.3 (Ritz values
     from conjugate gradients).
 
-    Args:
-        product, precondition: As of `conjugate_gradients`.
-        right: Right-hand side, (n,), of order one.
+    The arguments are those of `conjugate_gradients`; the right-hand side is of order one.
     """
-    diagonal: list[float] = []
-    off_diagonal: list[float] = []
+    diagonal, off_diagonal = list[float](), list[float]()
     state = KrylovState(np.zeros_like(right), right, precondition, (diagonal, off_diagonal))
     yield state
     direction, rz, carried = state.preconditioned, float(right @ state.preconditioned), 0.0
@@ -253,8 +220,7 @@ def krylov_steps(product: Map, precondition: Map, right: Array) -> Iterator[Kryl
         length = rz / curvature
         diagonal.append(1 / length + carried)
         x, residual = state.solution + length * direction, state.residual - length * image
-        state = replace(state, solution=x, residual=residual)
-        yield state
+        yield (state := replace(state, solution=x, residual=residual))
         rz, before = float(residual @ state.preconditioned), rz
         ratio = rz / before
         carried = ratio / length
@@ -268,10 +234,7 @@ def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int =
     M is near K, so that all eigenvalues but a few are near 1 and a few Lanczos steps from a fixed
     random vector find the others. More than three are taken only if the smallest is below 1/2.
 
-    Args:
-        product, precondition: As of `conjugate_gradients`.
-        size: n.
-        steps: Largest number of Lanczos steps.
+    The maps are those of `conjugate_gradients`, for `size` unknowns.
     """
     least, right = math.inf, np.random.default_rng(0).standard_normal(size)
     for k, step in enumerate(islice(krylov_steps(product, precondition, right), steps + 1)):
@@ -283,30 +246,21 @@ def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int =
 
 @dataclass(frozen=True, eq=False)
 class CGFactor(Factor):
-    """A matrix and its preconditioner.
+    """A matrix and its preconditioner."""
 
-    Attributes:
-        product: Function x -> K x.
-        precondition: Function r -> M^-1 r, near K^-1 r.
-        max_iter: Largest number of iterations of a solve.
-    """
+    product: SymmetricProduct  # function x -> K x
+    precondition: Map  # function r -> M^-1 r, near K^-1 r
+    max_iter: int  # largest number of iterations of a solve
 
-    product: SymmetricProduct
-    precondition: Map
-    max_iter: int
-
+    @cached_property
     def stability(self) -> int:
-        """Return 0 or, if there are negative eigenvalues, 1; `UNKNOWN` without convergence.
+        """0 or, if there are negative eigenvalues, 1; `UNKNOWN` without convergence.
 
         CG detects negative curvature only in the Krylov space of its right-hand side, so this
         solves with a random one, which has a component along every eigenvector. The residual
         polynomial is 1 at zero and has positive roots only, hence exceeds 1 at a negative
         eigenvalue: a small residual proves that there is none.
         """
-        return self._stability
-
-    @cached_property
-    def _stability(self) -> int:
         noise = np.random.default_rng(0).standard_normal(len(self.product.diagonal))
         try:
             self.solve(noise, DEFINITENESS_TOL)
@@ -335,14 +289,10 @@ class CG:
     With pyamg and the near-nullspace the preconditioner is smoothed aggregation (Vanek, Mandel,
     Brezina 1996, Computing 56), whose number of iterations hardly grows with the body. Otherwise
     it is the diagonal.
-
-    Attributes:
-        pattern: Structure of the matrices.
-        near_null: Rigid body modes, (n, k), see `Problem.near_null`.
     """
 
-    pattern: Pattern
-    near_null: Array | None = None
+    pattern: Pattern  # structure of the matrices
+    near_null: Array | None = None  # rigid body modes, (n, k), see `Problem.near_null`
 
     def factorise(self, values: Array) -> CGFactor:
         """Return the factor, see `Backend.factorise`."""
@@ -350,17 +300,14 @@ class CG:
         product = SymmetricProduct(self.pattern, values.copy())
         if not (product.diagonal > 0).all():
             raise SingularMatrix("the matrix is not positive definite by its diagonal")
-        if self.near_null is not None and multigrid_installed():
-            return CGFactor(product, self._multigrid(values, self.near_null), max_iter=300)
-        inverse = 1 / product.diagonal
-        return CGFactor(product, lambda residual: inverse * residual, max_iter=5000)
-
-    def _multigrid(self, values: Array, near_null: Array) -> Map:
+        if self.near_null is None or not multigrid_installed():
+            inverse = 1 / product.diagonal
+            return CGFactor(product, lambda residual: inverse * residual, max_iter=5000)
         pyamg: Any = importlib.import_module("pyamg")
         whole = csr_matrix(full_matrix(self.pattern, values))  # pyamg needs spmatrix, not sparray
         hierarchy = pyamg.smoothed_aggregation_solver(
             whole.tobsr((self._block, self._block)),
-            B=near_null,
+            B=self.near_null,
             symmetry="symmetric",
             strength=("symmetric", {"theta": 0.0}),
             smooth=("jacobi", {"weighting": "local"}),  # other weightings draw random numbers
@@ -370,18 +317,16 @@ class CG:
             max_coarse=300,
             coarse_solver="cholesky",
         )
-        return hierarchy.aspreconditioner().matvec
+        return CGFactor(product, hierarchy.aspreconditioner().matvec, max_iter=300)
 
     @cached_property
     def _block(self) -> int:
         """Block size: D if all nodes have D fully coupled degrees of freedom, else 1."""
-        n, nnz = self.pattern.size, len(self.pattern.indices)
+        n, columns = self.pattern.size, self.pattern.indices
         dim = {6: 3, 3: 2}.get(0 if self.near_null is None else self.near_null.shape[1], 1)
-        if n % dim:
-            return 1
-        blocks = row_numbers(self.pattern).astype(np.int64) // dim * n + self.pattern.indices // dim
+        blocks = row_numbers(self.pattern).astype(np.int64) // dim * n + columns // dim
         filled = len(np.unique(blocks)) * dim**2 - n // dim * (dim * (dim - 1) // 2)
-        return dim if filled == nnz else 1
+        return dim if n % dim == 0 and filled == len(columns) else 1
 
 
 def multigrid_installed() -> bool:

@@ -27,8 +27,7 @@ def reduce_bandwidth(graph: csr_array) -> NDArray[np.int32]:
         end = csr_array(
             ([1], ([0], [degree[nodes].argmin()])), shape=(1, len(nodes)), dtype=graph.dtype
         )
-        own = graph if parts == 1 else graph[nodes][:, nodes]
-        longer = block_array([[own, end.T], [end, None]], format="csr")
+        longer = block_array([[graph[nodes][:, nodes], end.T], [end, None]], format="csr")
         order = reverse_cuthill_mckee(longer, symmetric_mode=True)
         orders.append(nodes[order[order < len(nodes)]])
     return np.concatenate(orders).astype(np.int32)
@@ -38,16 +37,11 @@ class BandStorage(NamedTuple):
     """Places of a pattern's entries in band storage, (n, half + 1), row by row.
 
     Row j contains column j of the lower triangle from the diagonal down, as LAPACK expects it.
-
-    Attributes:
-        order: Old number of each new unknown, (n,); None: unchanged.
-        half: Half-bandwidth b, the largest distance of an entry from the diagonal.
-        place: Flat index of each entry in the storage, (nnz,).
     """
 
-    order: NDArray[np.int32] | None
-    half: int
-    place: NDArray[np.intp]
+    order: NDArray[np.int32] | None  # old number of each new unknown, (n,); None: unchanged
+    half: int  # half-bandwidth b, the largest distance of an entry from the diagonal
+    place: NDArray[np.intp]  # flat index of each entry in the storage, (nnz,)
 
 
 def band_storage(pattern: Pattern, sweeps: int = 50) -> BandStorage:

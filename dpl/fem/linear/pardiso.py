@@ -21,14 +21,12 @@ class PardisoFactor(Factor):
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right."""
-        return self.parent.solve(self.matrix, right)
+        if self.parent.factorised is not self.matrix:
+            self.parent.store_factor(self.matrix)
+        return self.parent.call(33, self.matrix, np.ascontiguousarray(right))  # ignores strides
 
     def apply(self, right: Array) -> Array:
-        """Return `solve`, if MKL still stores this factor.
-
-        Raises:
-            SingularMatrix: MKL stores another one.
-        """
+        """Return `solve`; raise a SingularMatrix if MKL stores another factor."""
         if self.parent.factorised is not self.matrix:
             raise SingularMatrix("MKL stores the factor of another matrix")
         return self.solve(right)
@@ -53,19 +51,13 @@ class Pardiso:
     def factorise(self, values: Array) -> PardisoFactor:
         """Return the factor, see `Backend.factorise`."""
         require_finite(values)
-        pattern = self.pattern
-        entries = values.copy(), pattern.indices, pattern.indptr
-        matrix = csr_array(entries, shape=(pattern.size,) * 2)
-        self._factorise(matrix)
+        entries = values.copy(), self.pattern.indices, self.pattern.indptr
+        matrix = csr_array(entries, shape=(self.pattern.size,) * 2)
+        self.store_factor(matrix)
         return PardisoFactor(self, matrix, int(self._solver.get_iparm(23)))
 
-    def solve(self, matrix: csr_array, right: Array) -> Array:
-        """Return x, (n,), with K x = right, for a matrix that has been factorised before."""
-        if self.factorised is not matrix:
-            self._factorise(matrix)
-        return self._call(33, matrix, np.ascontiguousarray(right))  # MKL ignores strides
-
-    def _factorise(self, matrix: csr_array) -> None:
+    def store_factor(self, matrix: csr_array) -> None:
+        """Factorise a matrix in MKL, in place of the one whose factor it stores."""
         self.factorised = None
         if self._solver is None:
             from pypardiso import PyPardisoSolver
@@ -76,13 +68,14 @@ class Pardiso:
             # Each process searches the whole environment for MKL, a second or more, if not told.
             os.environ.setdefault("PYPARDISO_MKL_RT", self._solver.libmkl._name)
             weakref.finalize(self, self._solver.free_memory, everything=True)
-            self._call(11, matrix, np.zeros(self.pattern.size))
-        self._call(22, matrix, np.zeros(self.pattern.size))
+            self.call(11, matrix, np.zeros(self.pattern.size))
+        self.call(22, matrix, np.zeros(self.pattern.size))
         if self._solver.get_iparm(14):  # MKL replaces zero pivots silently
             raise SingularMatrix(f"{self._solver.get_iparm(14)} pivots are zero to rounding")
         self.factorised = matrix
 
-    def _call(self, phase: int, matrix: csr_array, right: Array) -> Array:
+    def call(self, phase: int, matrix: csr_array, right: Array) -> Array:
+        """Return the result of a phase of PARDISO, (n,): 11 analyse, 22 factorise, 33 solve."""
         from pypardiso.pardiso_wrapper import PyPardisoError
 
         self._solver.set_phase(phase)

@@ -18,6 +18,9 @@ from dpl.fem.linear.interface import (
     require_finite,
 )
 
+# Settings with which SuperLU pivots on the diagonal.
+ON_DIAGONAL: dict[str, Any] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+
 
 @dataclass(frozen=True, eq=False)
 class SuperLUFactor(Factor):
@@ -60,7 +63,7 @@ class SuperLU:
         model = np.full(count, -1.0)  # any positive definite values
         model[self.pattern.indptr[:-1]] = 4.0 * count
         whole = full_matrix(self.pattern, model).tocsc()
-        order = np.argsort(splu(whole, **_symmetric("MMD_AT_PLUS_A")).perm_c)
+        order = np.argsort(splu(whole, permc_spec="MMD_AT_PLUS_A", **ON_DIAGONAL).perm_c)
         numbers = full_matrix(self.pattern, np.arange(1.0, count + 1)).tocsc()
         structure = numbers[:, order][order]
         structure.sort_indices()
@@ -72,11 +75,6 @@ class SuperLU:
         order, structure, source = self._plan
         matrix = csc_array((values[source], structure.indices, structure.indptr), structure.shape)
         try:
-            return SuperLUFactor(splu(matrix, **_symmetric("NATURAL")), order)
+            return SuperLUFactor(splu(matrix, permc_spec="NATURAL", **ON_DIAGONAL), order)
         except RuntimeError as error:
             raise SingularMatrix(str(error)) from error
-
-
-def _symmetric(order: str) -> dict[str, Any]:
-    """Return the settings with which SuperLU pivots on the diagonal."""
-    return {"permc_spec": order, "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}

@@ -19,17 +19,11 @@ BLOCK = 16  # states whose cell forces are in memory at a time
 
 
 class Cubature(NamedTuple):
-    """Weighted cells whose reduced forces approximate those of all cells.
+    """Weighted cells whose reduced forces approximate those of all cells."""
 
-    Attributes:
-        cells: Numbers of the cells, ascending, (C,).
-        weights: Positive weights, (C,).
-        error: Relative error of the reduced forces at the states they were fitted to [-].
-    """
-
-    cells: Tensor
-    weights: Tensor
-    error: float
+    cells: Tensor  # numbers of the cells, ascending, (C,)
+    weights: Tensor  # positive weights, (C,)
+    error: float  # relative error of the reduced forces at the states they were fitted to [-]
 
 
 def cubature(
@@ -48,8 +42,7 @@ def cubature(
     Source: Farhat, Avery, Chapman, Cortial (2014), Int. J. Numer. Methods Eng. 98, section 3.
 
     Args:
-        problem: The body.
-        vectors: V, (N, D, R).
+        problem, vectors: The body and V, (N, D, R).
         states: Displacements, (S, N, D); the memory is C^2 numbers for any S.
         tolerance: Root of the mean square of the relative errors [-], not below 1e-6.
         candidates: Numbers of the cells to choose from, (C,); None: all.
@@ -105,9 +98,7 @@ def nonnegative(
     Farhat, Avery, Chapman, Cortial (2014), Int. J. Numer. Methods Eng. 98, algorithm 1.
 
     Args:
-        gram: G^T G, (E, E).
-        target: G^T b, (E,).
-        size: b^T b.
+        gram, target, size: G^T G, (E, E), G^T b, (E,), and b^T b.
         tolerance: Relative error [-], not below 1e-6, which G^T G cannot resolve.
         scale: Norm that the error is relative to, above 0.
     """
@@ -127,7 +118,8 @@ def nonnegative(
         rows[len(kept)] = gram[new]
         kept, weights, first = np.append(kept, new), np.append(weights, 0.0), len(kept)
         while _factorised(factor, gram, kept, first):
-            best = _solved(factor, target[kept])
+            lower = factor[: len(kept), : len(kept)]
+            best = cho_solve((lower, True), target[kept], check_finite=False)
             if (falling := best <= 0).any():
                 length = (weights[falling] / (weights[falling] - best[falling])).min()
                 weights += length * (best - weights)
@@ -167,10 +159,6 @@ def _factorised(factor: Array, gram: Array, kept: NDArray[np.int64], first: int)
     return True
 
 
-def _solved(factor: Array, right: Array) -> Array:
-    return cho_solve((factor[: len(right), : len(right)], True), right, check_finite=False)
-
-
 class ReducedMesh:
     """Weighted cells of a body, without common nodes, with a basis at their nodes.
 
@@ -182,9 +170,8 @@ class ReducedMesh:
 
     def __init__(self, problem: Problem, vectors: Tensor, cells: Tensor, weights: Tensor) -> None:
         """Select cells by numbers (C,), with weights (C,), of a body with basis V (N, D, R)."""
-        per_cell, dim = problem.cells.shape[1], problem.shape[1]
         nodes = problem.cells[cells].flatten()
-        fields = len(nodes), dim
+        fields = len(nodes), problem.shape[1]
 
         def of_cells(tensor: Tensor) -> Tensor:
             return tensor.expand(len(problem.cells), *tensor.shape[1:])[cells].contiguous()
@@ -197,7 +184,7 @@ class ReducedMesh:
             problem,
             material=problem.material.of_cells(cells),
             points=problem.points[nodes],
-            cells=torch.arange(len(nodes)).view(-1, per_cell),
+            cells=torch.arange(len(nodes)).view(len(cells), -1),
             dN=of_cells(problem.dN),
             dV=of_cells(problem.dV) * weights[:, None],
             volume_functions=functions,

@@ -8,7 +8,7 @@ from torch.nn.functional import pad
 
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.linear.krylov import conjugate_gradients_of_tensors
-from dpl.fem.problem import Problem
+from dpl.fem.rom.pod import scatter_fields
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 
 EXACT = 1e-12  # relative error of reduced solutions [-]
@@ -26,26 +26,19 @@ class ReducedStiffness:
     """
 
     def __init__(self, parts: Tensor, terms: StiffnessTerms) -> None:
-        """Compute the inverse of the node.
+        """Compute the inverse of the node from `reduced_terms` and the terms of the whole matrix.
 
-        Args:
-            parts: See `reduced_terms`.
-            terms: Terms of the whole matrix. A projection has no larger condition number than
-                K(node)^-1 K(0).
+        A projection has no larger condition number than K(node)^-1 K(0).
         """
         self.parts, self._steps = parts, 4 * terms.bound if terms.varies else 0
         self._inverse = torch.linalg.inv_ex(self.at(terms.node.to(parts))[0, :, :-1]).inverse
 
     def solve(self, factors: Tensor, right: Tensor) -> Tensor:
-        """Return the coordinates (B, R) of Galerkin linear solutions.
+        """Return the coordinates (B, R) of Galerkin linear solutions of V^T f, (B, R).
 
-        ONNX has no linear solver: the steps of conjugate gradients are the same in a graph. Four
-        times the steps of a solution have the fourth power of its error; the maps amplify errors of
-        large loads.
-
-        Args:
-            factors: a, (1, T) or (B, T).
-            right: V^T f, (B, R).
+        The factors a are (1, T) or (B, T). ONNX has no linear solver: the steps of conjugate
+        gradients are the same in a graph. Four times the steps of a solution have the fourth power
+        of its error; the maps amplify errors of large loads.
         """
         factors = pad(factors.to(right).expand(right.shape[0], -1), (0, 1), value=1.0)
         parts, inverse = self.parts.to(right), self._inverse.to(right)
@@ -72,21 +65,14 @@ class ReducedStiffness:
 
 def reduced_terms(terms: StiffnessTerms, modes: Tensor) -> Tensor:
     """Return V^T K_k [V, p] of each term and of the springs, (T + 1, R, R + 1), of V (n, R)."""
-    columns, free = modes.double().numpy(), terms.problem.free
-    supports, products = terms.support_forces()[:-1, free], []
+    problem, modes, products = terms.problem, modes.double(), []
+    supports, columns = terms.support_forces()[:-1, problem.free], modes.numpy()
     for body, moved in zip(terms.bodies, supports, strict=True):
         matrix = full_matrix(body.pattern, body.stiffness_at_rest().numpy())
         own = torch.from_numpy(columns.T @ (matrix @ columns))
-        products.append(torch.cat([(own + own.T) / 2, modes.double().T @ moved[:, None]], 1))
-    return torch.stack([*products, _springs(terms.problem, modes.double())])
-
-
-def _springs(problem: Problem, modes: Tensor) -> Tensor:
-    """Return V^T C [V, p], (R, R + 1), of the foundation."""
-    count = modes.shape[1]
-    if problem.springs is None:
-        return torch.zeros(count, count + 1, dtype=torch.float64)
-    fields = torch.zeros(count + 1, *problem.shape, dtype=torch.float64)
-    fields[:-1, problem.free] = modes.T
-    fields[-1] = problem.prescribed
-    return modes.T @ problem.springs.force(fields)[:, problem.free].T
+        products.append(torch.cat([(own + own.T) / 2, modes.T @ moved[:, None]], 1))
+    products.append(torch.zeros_like(products[0]))
+    if problem.springs is not None:
+        fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])
+        products[-1] = modes.T @ problem.springs.force(fields)[:, problem.free].T
+    return torch.stack(products)

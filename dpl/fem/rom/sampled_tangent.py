@@ -14,7 +14,7 @@ from dpl.fem.linear.interface import full_matrix
 from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
-from dpl.fem.rom.ecsw import Cubature, whitening
+from dpl.fem.rom.ecsw import Cubature, ReducedMesh, whitening
 from dpl.fem.rom.reduced_stiffness import reduced_terms
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 
@@ -38,51 +38,38 @@ class SampledTangent:
 
     def __init__(self, problem: Problem, vectors: Tensor, cubature: Cubature | None) -> None:
         """Reduce a body to V (N, D, R) and to weighted cells; None: all cells, not sampled."""
-        self.problem = problem
+        self.problem, self._has_cells = problem, cubature is not None
         scale = whitening(problem.reference, vectors)
-        white = (vectors @ scale).flatten(0, 1)
-        self.scale = scale.numpy()
-        self.rows: Single = white.float().numpy()
-        self._white = white.numpy()
+        white = vectors @ scale
+        self.scale, self._white = scale.numpy(), white[problem.free].numpy()
+        self.rows: Single = white.flatten(0, 1).float().numpy()
         if cubature is not None:
-            self._sample(cubature)
-        self._has_cells = cubature is not None
-
-    def _sample(self, chosen: Cubature) -> None:
-        problem, count = self.problem, len(chosen.cells)
-
-        def of_cells(tensor: Tensor) -> Tensor:
-            return tensor.expand(len(problem.cells), *tensor.shape[1:])[chosen.cells]
-
-        dN, dV = of_cells(problem.dN), of_cells(problem.dV)
-        volume = dV.sum(1)
-        mean = (dN * dV[..., None, None]).sum(1) / volume[:, None, None]  # (C, A, D)
-        nodes = problem.cells[chosen.cells]
-        dim, rank = problem.shape[1], self.rows.shape[1]
-        white = torch.from_numpy(self._white).view(*problem.shape, rank)
-        basis = torch.einsum("cair,caj->cijr", white[nodes], mean)
-        self._cells = chosen.cells
-        self._nodes = nodes.contiguous().numpy()
-        self._dN = mean[:, None].contiguous().numpy()
-        self._dV = (volume * chosen.weights.double())[:, None].contiguous().numpy()
-        self._basis: Single = basis.reshape(count, dim * dim, rank).float().contiguous().numpy()
+            self._cells = cubature.cells
+            sampled = ReducedMesh(problem, white, self._cells, cubature.weights.double())
+            dN, dV, nodes = sampled.problem.dN, sampled.problem.dV, problem.cells[self._cells]
+            volume = dV.sum(dim=1, keepdim=True)
+            mean = (dN * (dV / volume)[..., None, None]).sum(dim=1)  # (C, A, D)
+            basis = torch.einsum("cair,caj->cijr", white[nodes], mean).flatten(1, 2)
+            self._nodes, self._dV = nodes.numpy(), volume.numpy()
+            self._dN: Array = mean[:, None].contiguous().numpy()
+            self._basis: Single = basis.float().contiguous().numpy()
 
     def at(self, problem: Problem, displacement: Tensor, *, whole: bool = False) -> Array:
         """Return the matrix (R, R) at a displacement (N, D) of the body with its parameters.
 
-        Only its symmetric part has a meaning; rounding makes the matrix slightly unsymmetric.
-
-        Args:
-            problem: The body with its parameters.
-            displacement: (N, D) [-].
-            whole: Sum over all cells, not the chosen ones.
+        Only its symmetric part has a meaning; rounding makes the matrix slightly unsymmetric. With
+        `whole` it sums over all cells instead of the chosen ones.
         """
         if whole or not self._has_cells:
-            return self._projection(problem, problem.linearise(displacement[None]).tangent[0])
-        product = self._moduli_change_product(problem, displacement)
-        rank = product.shape[2]
+            tangent = problem.linearise(displacement[None]).tangent[0].numpy()
+            return self._white.T @ (full_matrix(problem.pattern, tangent) @ self._white)
+        product, rank = self._moduli_change_product(problem, displacement), len(self.scale)
         change = self._basis.reshape(-1, rank).T @ product.reshape(-1, rank)
-        return self._at_rest(problem.material) + change
+        if not self.problem.material.parameter_ranges:
+            return np.eye(rank) + change
+        terms, matrices = self._terms
+        factors = np.append(terms.factors(problem.material)[0].numpy(), 1.0)
+        return np.tensordot(factors, matrices, 1) + change
 
     def _moduli_change_product(self, problem: Problem, displacement: Tensor) -> Single:
         """Return w vol (A(H) - A(0)) G, (C, D D, R)."""
@@ -106,34 +93,15 @@ class SampledTangent:
         H = torch.einsum("cai,caj->cij", at_cells, torch.from_numpy(self._dN[:, 0]))
         H = torch.nn.functional.pad(H, (0, 3 - dim, 0, 3 - dim))[None, :, None]
         change = (law.tangent(H) - law.tangent(torch.zeros_like(H)))[0, :, 0]
-        change = (
-            change[:, :dim, :dim, :dim, :dim] * torch.from_numpy(self._dV)[..., None, None, None]
-        )
-        return change.reshape(-1, dim * dim, dim * dim).float().numpy() @ self._basis
+        change = change[:, :dim, :dim, :dim, :dim].reshape(-1, dim * dim, dim * dim)
+        return (change * torch.from_numpy(self._dV)[..., None]).float().numpy() @ self._basis
 
     @cached_property
     def _required_terms(self) -> int:
         return required_terms(form_of(one_law(self.problem.reference.material)))
 
-    def _at_rest(self, law: Material) -> Array:
-        """Return W^T K(0) W, (R, R), of a law of the body."""
-        if not self.problem.material.parameter_ranges:
-            return np.eye(len(self.scale))
-        factors = np.append(self._terms.factors(law)[0].numpy(), 1.0)
-        return np.tensordot(factors, self._reduced_terms, 1)
-
     @cached_property
-    def _reduced_terms(self) -> Array:
-        """W^T K_k W of the terms of K(0) and of the springs, (T + 1, R, R)."""
-        free = self.problem.free.flatten().numpy()
-        return reduced_terms(self._terms, torch.from_numpy(self._white[free]))[..., :-1].numpy()
-
-    @cached_property
-    def _terms(self) -> StiffnessTerms:
-        return StiffnessTerms.of(self.problem)
-
-    def _projection(self, problem: Problem, tangent: Tensor) -> Array:
-        """Return W^T K W of the entries (nnz,) of a tangent."""
-        free = problem.free.flatten().numpy()
-        white = self._white if free.all() else self._white[free]
-        return white.T @ (full_matrix(problem.pattern, tangent.numpy()) @ white)
+    def _terms(self) -> tuple[StiffnessTerms, Array]:
+        """Terms of K(0), and W^T K_k W of them and of the springs, (T + 1, R, R)."""
+        terms = StiffnessTerms.of(self.problem)
+        return terms, reduced_terms(terms, torch.from_numpy(self._white))[..., :-1].numpy()

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import torch
 from scipy.linalg import lapack
+from scipy.linalg.blas import dnrm2  # without under- or overflow of squares
 from torch import Tensor
 
-from dpl.fem.linear.krylov import scaled_norm
+from dpl.fem.options import check_options, option
 from dpl.fem.problem import Evaluation, Problem
 from dpl.fem.rom.ecsw import Cubature, cubature, refuse_follower_loads
 from dpl.fem.rom.sampled_tangent import Array, SampledTangent, Single
@@ -26,20 +27,12 @@ _Correction = tuple[Array, Callable[[Array], Array]]  # coordinates in W, (R,); 
 
 
 class SubspaceState(NamedTuple):
-    """An evaluated displacement under one load.
+    """An evaluated displacement under one load."""
 
-    Attributes:
-        displacement: u, (1, N, D) [-].
-        evaluation: Internal force and min det F at u.
-        error: Estimated error of u within the subspace, relative to ||u|| [-]; infinite where an
-            element is inverted.
-        iterations: Number of steps so far.
-    """
-
-    displacement: Tensor
-    evaluation: Evaluation
-    error: float
-    iterations: int
+    displacement: Tensor  # u, (1, N, D) [-]
+    evaluation: Evaluation  # internal force and min det F at u
+    error: float  # estimated within the subspace over ||u|| [-]; infinite if an element is inverted
+    iterations: int  # number of steps so far
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,16 +74,15 @@ class SubspaceNewton:
         max_iter: Largest number of steps.
 
     Raises:
-        ValueError: V does not fit the body, an attribute is out of range, or, at the first load,
-            the body has rigid body modes.
+        ValueError: At the first load, if the body has rigid body modes.
     """
 
     problem: Problem
     vectors: Tensor
     cubature: Cubature | None = None
     tol: float = 1e-8
-    error_tol: float = 2e-5
-    max_iter: int = 4
+    error_tol: float = option("", default=2e-5, above=0, most=1)
+    max_iter: int = option("", default=4, least=0)
 
     @classmethod
     def within(
@@ -108,8 +100,7 @@ class SubspaceNewton:
         Args:
             problem, vectors, options: Attributes of the solver.
             states: Displacements in equilibrium, (S, N, D) [-].
-            tolerance: Relative error of the reduced forces of the chosen cells, see `cubature`.
-            candidates: Numbers of the cells to choose from, (C,); None: all.
+            tolerance, candidates: Arguments of `cubature`.
         """
         cells = cubature(problem.reference, vectors, states, tolerance, candidates)
         return cls(problem, vectors, cells, **options)
@@ -117,12 +108,9 @@ class SubspaceNewton:
     def __post_init__(self) -> None:
         refuse_follower_loads(self.problem, type(self).__name__)
         check_tol(self.tol)
-        if not 0 < self.error_tol <= 1:
-            raise ValueError(f"error_tol = {self.error_tol} must be above 0 and at most 1")
-        if self.max_iter < 0:
-            raise ValueError(f"max_iter = {self.max_iter} must be 0 or more")
-        if self.vectors.ndim != 3 or tuple(self.vectors.shape[:2]) != self.problem.shape:
-            found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")
+        check_options(self)
+        found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")
+        if len(found) != 3 or found[:2] != wanted[:2]:
             raise ValueError(f"vectors.shape = {found} must be {wanted}")
         if self.vectors[~self.problem.free].any():
             raise ValueError("vectors must be zero at fixed degrees of freedom")
@@ -168,8 +156,7 @@ class SubspaceNewton:
         Residual norms and status are not computed.
 
         Args:
-            load: The load, B = 1.
-            guess: Displacement to start from, (1, N, D) [-].
+            load, guess: The load, B = 1, and the displacement to start from, (1, N, D) [-].
             evaluation: Internal force and min det F at the guess, if known. The guess must then
                 have the displacement of the supports.
             error_tol, max_iter: Replace the attributes of the solver.
@@ -211,13 +198,10 @@ class SubspaceNewton:
     def _correction(
         self, problem: Problem, load: Load, state: SubspaceState, *, whole: bool = False
     ) -> _Correction | None:
-        """Return Newton's correction; None where an element is inverted.
-
-        `whole` stands for the tangent of all cells.
-        """
-        right = self._reduced_residual(load, state.evaluation)
-        if right is None or not state.evaluation.volume_ratio > 0:
+        """Return Newton's correction, None where an element is inverted; `whole`: of all cells."""
+        if not state.evaluation.volume_ratio > 0:
             return None
+        right = self._reduced_residual(load, state.evaluation)
         tangent = self.tangent.at(problem, state.displacement[0], whole=whole)
         solve = _factorised(tangent)
         y = solve(right)
@@ -233,41 +217,33 @@ class SubspaceNewton:
     ) -> SubspaceState | None:
         """Return the state after the longest acceptable step, None if none was found in time."""
         full, solve = correction
-        size, update = self._norm(full), self._update(full)
+        product = torch.from_numpy(_scaled_product(self.tangent.rows, full))
+        size, update = self._norm(full), product.view(self.problem.shape)
         lowest = MIN_DETF_RATIO * min(float(state.evaluation.volume_ratio), 1.0)
         damping = 1.0
         while damping >= MIN_DAMPING and not is_over():
             u = state.displacement + damping * update
             evaluation = problem.evaluate(u)
             if evaluation.volume_ratio > lowest:
-                right = self._reduced_residual(load, evaluation)
-                y = None if right is None else solve(right)
-                if y is not None and self._norm(y) < (1 - damping / 4) * size:
+                y = solve(self._reduced_residual(load, evaluation))
+                if self._norm(y) < (1 - damping / 4) * size:
                     return SubspaceState(u, evaluation, self._relative(y, u), state.iterations + 1)
             damping /= 2
         return None
 
-    def _reduced_residual(self, load: Load, evaluation: Evaluation) -> Array | None:
-        """Return W^T (f - f_int), (R,); None if it is not finite."""
+    def _reduced_residual(self, load: Load, evaluation: Evaluation) -> Array:
+        """Return W^T (f - f_int), (R,); NaN if it is not finite."""
         residual = (load.force[0] - evaluation.internal[0]).flatten().numpy()
         return _scaled_product(self.tangent.rows.T, residual)
 
-    def _update(self, y: Array) -> Tensor:
-        """Return the displacement W y, (N, D)."""
-        update = _scaled_product(self.tangent.rows, y)
-        assert update is not None  # corrections are finite
-        return torch.from_numpy(update).view(self.problem.shape)
-
     def _norm(self, y: Array) -> float:
         """Return ||s|| of coordinates y in W."""
-        return scaled_norm(self.tangent.scale @ y)
+        return float(dnrm2(self.tangent.scale @ y))
 
     def _relative(self, y: Array, displacement: Tensor) -> float:
         """Return ||s|| / ||u||; zero if both are, infinite if only u is zero."""
-        size, whole = self._norm(y), scaled_norm(displacement.flatten().numpy())
-        if whole == 0:
-            return math.inf if size else 0.0
-        return size / whole
+        size, whole = self._norm(y), float(dnrm2(displacement.flatten().numpy()))
+        return size / whole if whole else math.inf if size else 0.0
 
     @cached_property
     def tangent(self) -> SampledTangent:
@@ -296,9 +272,9 @@ def _factorised(matrix: Array) -> Callable[[Array], Array]:
     return lambda right: axes @ (inverse * (right @ axes))
 
 
-def _scaled_product(matrix: Single, vector: Array) -> Array | None:
-    """Return A v in float32, None if v is not finite; v is scaled so that no v is too small."""
+def _scaled_product(matrix: Single, vector: Array) -> Array:
+    """Return A v in float32, NaN if v is not finite; v is scaled so that no v is too small."""
     largest = float(np.abs(vector).max())
     if not 0 < largest < math.inf:
-        return np.zeros(len(matrix)) if largest == 0 else None
+        return np.full(len(matrix), 0.0 if largest == 0 else np.nan)
     return largest * (matrix @ (vector / largest).astype(np.float32)).astype(np.float64)

@@ -40,12 +40,7 @@ class AndersonSolver:
     max_iter: int = 30
 
     def iterate(self, load: Load, *, guess: Tensor) -> Iterator[Solution]:
-        """Yield the guess and the state after each iteration; loads in lockstep.
-
-        Args:
-            load: The load.
-            guess: Displacement to start from, (B, N, D) [-].
-        """
+        """Yield the guess (B, N, D) [-] and the state after each iteration; loads in lockstep."""
         pairs = zip(load.unbatch(), guess.split(1), strict=True)
         yield from run_lockstep([self._member(single, u) for single, u in pairs])
 
@@ -56,7 +51,7 @@ class AndersonSolver:
         u = torch.where(problem.free, guess, problem.prescribed)
         factor: CorotatedFactor | None = None
         residuals: list[float] = []
-        right = step = np.zeros(0)
+        right = step = np.zeros(problem.pattern.size)
         steps, changes = (deque[Array](maxlen=self.memory) for _ in range(2))
         for count in range(self.max_iter + 1):
             evaluation = problem.evaluate(u)
@@ -74,21 +69,11 @@ class AndersonSolver:
             before, right = right, problem.restrict(load.force[0] - evaluation.internal[0])
             if factor is None:
                 factor = newton.linear_solver.corotational.at(u)
-            else:
+                step = factor.apply(right)
+            else:  # from the combination of iterates with the smallest residual
                 steps.append(step)
                 changes.append(right - before)
-            step = _step(right, list(steps), list(changes), factor)
+                S, C = np.stack(steps), np.stack(changes)
+                weights = np.linalg.lstsq(C @ C.T, C @ right, rcond=1e-13)[0]
+                step = factor.apply(right - weights @ C) - weights @ S
             u = u + problem.extend(step)[None]
-
-
-def _step(right: Array, steps: list[Array], changes: list[Array], factor: CorotatedFactor) -> Array:
-    """Return the step (n,) from the combination of iterates with the smallest residual.
-
-    `right` is the residual at the last iterate; `changes` are those of the residual by each of the
-    last steps.
-    """
-    if not steps:
-        return factor.apply(right)
-    S, C = np.stack(steps), np.stack(changes)
-    weights = np.linalg.lstsq(C @ C.T, C @ right, rcond=1e-13)[0]
-    return factor.apply(right - weights @ C) - weights @ S

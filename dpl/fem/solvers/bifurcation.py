@@ -15,14 +15,8 @@ from dpl.fem.solvers.solution import Load, Solution
 def unstable_directions(newton: Newton, solution: Solution) -> Tensor:
     """Return the eigenvectors of the tangent with negative eigenvalues, (M, N, D).
 
-    The largest nodal displacement of each is 1; the most negative comes first.
-
-    Args:
-        newton: The solver.
-        solution: Its solution for one load, B = 1, with status UNSTABLE.
-
-    Raises:
-        ValueError: The solution is not known to be unstable.
+    The largest nodal displacement of each is 1; the most negative comes first. The solution of one
+    load, B = 1, has the status UNSTABLE; one with another status is a ValueError.
     """
     count = int(solution.negative_pivots[0])
     if count < 1:
@@ -30,16 +24,11 @@ def unstable_directions(newton: Newton, solution: Solution) -> Tensor:
     problem = newton.problem
     values = problem.linearise(solution.displacement).tangent[0].numpy()
     factor = newton.linear_solver.tangent_backend.factorise(values)
-    size = problem.pattern.size
-    inverse = LinearOperator((size, size), matvec=factor.solve, dtype=np.float64)
+    matrix, size = full_matrix(problem.pattern, values), problem.pattern.size
+    inverse = LinearOperator(matrix.shape, matvec=factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(size)
-    lowest, vectors = eigsh(
-        full_matrix(problem.pattern, values),
-        min(2 * count + 4, size - 1),  # eigenvalues around zero include positive ones
-        sigma=0.0,
-        OPinv=inverse,
-        v0=start,
-    )
+    some = min(2 * count + 4, size - 1)  # eigenvalues around zero include positive ones
+    lowest, vectors = eigsh(matrix, some, sigma=0.0, OPinv=inverse, v0=start)
     negative = np.argsort(lowest)[: int((lowest < 0).sum())]
     fields = torch.stack([problem.extend(vectors[:, k]) for k in negative])
     return fields / fields.norm(dim=-1).amax(dim=1)[:, None, None]
@@ -56,13 +45,8 @@ def post_buckling_branches(
     equally soft, as for a square section, a branch may be unstable itself; its status shows it.
 
     Args:
-        newton: The solver.
-        load: One load, B = 1.
-        solution: Its unstable solution.
+        newton, load, solution: The solver, one load, B = 1, and its unstable solution.
         imperfection: Norm of the small force over that of the load [-].
-
-    Raises:
-        ValueError: The solution is not known to be unstable.
     """
     newton = replace(newton, mixed_integration=True)  # plain Newton returns to the primary path
     direction = unstable_directions(newton, solution)[:1]

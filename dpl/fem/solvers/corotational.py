@@ -6,7 +6,6 @@ nodes (stiffness warping).
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
 
 import numpy as np
 from numba import float64, int64, njit, void
@@ -14,10 +13,9 @@ from numba.types import Array as Typed
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dpl.fem.assembly.discretisation import Discretisation
 from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
-from dpl.fem.linear.interface import Array, Factor, SymmetricProduct
-from dpl.fem.linear.krylov import krylov_steps, smallest_ritz_value
-from dpl.fem.problem import Problem
+from dpl.fem.linear.interface import Array, Factor
 
 MAX_POLAR_ITER = 20  # of a polar decomposition; near a rotation it takes three iterations
 POLAR_TOL = 1e-5  # change of an iteration below which the error is below rounding (its square)
@@ -35,14 +33,10 @@ class CorotationalPreconditioner:
 
     Source: Mueller, Dorsey, McMillan, Jagnow, Cutler (2002), Stable real-time deformations,
     section 3.2.
-
-    Attributes:
-        problem: The body.
-        factor: Factor of its K(0).
     """
 
-    problem: Problem
-    factor: Factor
+    discretisation: Discretisation  # cells and free degrees of freedom of the body
+    factor: Factor  # factor of its K(0)
 
     def at(self, displacement: Tensor) -> "CorotatedFactor":
         """Return the factor of K(0), rotated as the body is at a displacement (1, N, D) [-].
@@ -60,29 +54,6 @@ class CorotationalPreconditioner:
         _rotations(sums, weights, rotations.reshape(-1, 9))
         return CorotatedFactor(self.factor, rotations, numbers)
 
-    def count_iterations(
-        self, displacement: Tensor, *, rtol: float = 1e-3, max_iter: int = 50
-    ) -> int:
-        """Return the conjugate gradient iterations with the tangent at (1, N, D) and this factor.
-
-        The right-hand side is random; the result is at most `max_iter`.
-        """
-        right = np.random.default_rng(0).standard_normal(self.problem.pattern.size)
-        product, factor = self._tangent(displacement), self.at(displacement)
-        steps = islice(krylov_steps(product, factor.apply, right), max_iter)
-        enough = rtol * np.linalg.norm(right)
-        small = (k for k, step in enumerate(steps) if np.linalg.norm(step.residual) <= enough)
-        return next(small, max_iter)
-
-    def smallest_ritz_value(self, displacement: Tensor) -> float:
-        """Return the smallest Ritz value of this inverse times the tangent at (1, N, D) [-]."""
-        product, factor = self._tangent(displacement), self.at(displacement)
-        return smallest_ritz_value(product, factor.apply, self.problem.pattern.size)
-
-    def _tangent(self, displacement: Tensor) -> SymmetricProduct:
-        values = self.problem.linearise(displacement).tangent[0].numpy()
-        return SymmetricProduct(self.problem.pattern, values)
-
     @cached_property
     def _arrays(self) -> tuple[Array, Array, NDArray[np.int64], Array, NDArray[np.int64]]:
         """Arrays of the loops over cells and nodes, in 2D with zeros in the third direction.
@@ -92,13 +63,13 @@ class CorotationalPreconditioner:
         column of its gradient are free, else 0, (N, 9), and the numbers of its free degrees of
         freedom, else -1, (N, 3).
         """
-        dN, dV = self.problem.dN.numpy(), self.problem.dV.numpy()
+        dN, dV = self.discretisation.dN.numpy(), self.discretisation.dV.numpy()
         # a copy: sending the problem to a process moves the memory of its tensors
-        cells = self.problem.cells.numpy().copy(order="C")
-        (nodes, dim), volumes = self.problem.shape, dV.sum(axis=1)
+        cells = self.discretisation.cells.numpy().copy(order="C")
+        (nodes, dim), volumes = self.discretisation.shape, dV.sum(axis=1)
         gradients = np.zeros((len(dN), dN.shape[2], 3))
         gradients[..., :dim] = np.einsum("eqaj,eq->eaj", dN, dV) / volumes[:, None, None]
-        numbers, free_numbers = np.full((nodes, 3), -1), self.problem.discretisation.free_numbers
+        numbers, free_numbers = np.full((nodes, 3), -1), self.discretisation.free_numbers
         numbers[np.divmod(free_numbers, dim)] = np.arange(len(free_numbers))
         free, each = numbers >= 0, np.broadcast_to(volumes[:, None], cells.shape)
         around = np.bincount(cells.ravel(), each.ravel(), nodes)
@@ -109,33 +80,21 @@ class CorotationalPreconditioner:
 
 @dataclass(frozen=True, eq=False)
 class CorotatedFactor(Factor):
-    """R K(0)^-1 R^T, symmetric, and positive definite if K(0) is.
+    """R K(0)^-1 R^T, symmetric, and positive definite if K(0) is."""
 
-    Attributes:
-        factor: Factor of K(0).
-        rotations: Rotations R of the nodes, (N, 3, 3).
-        numbers: Numbers of the free degrees of freedom, else -1, (N, 3).
-    """
-
-    factor: Factor
-    rotations: Array
-    numbers: NDArray[np.int64]
+    factor: Factor  # factor of K(0)
+    rotations: Array  # rotations R of the nodes, (N, 3, 3)
+    numbers: NDArray[np.int64]  # numbers of the free degrees of freedom, else -1, (N, 3)
 
     def apply(self, right: Array) -> Array:
         """Return R M R^T right, (n,), M the inverse of K(0) or its preconditioner."""
-        return self._from_frames(self.factor.apply(self._to_frames(right)))
+        found = self.factor.apply(_rotated(self.rotations.mT, self.numbers, right))
+        return _rotated(self.rotations, self.numbers, found)
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return R K(0)^-1 R^T right, (n,), to a relative residual, see `Factor.solve`."""
-        return self._from_frames(self.factor.solve(self._to_frames(right), rtol))
-
-    def _to_frames(self, x: Array) -> Array:
-        """Return R^T x, (n,)."""
-        return _rotated(self.rotations.mT, self.numbers, x)
-
-    def _from_frames(self, x: Array) -> Array:
-        """Return R x, (n,)."""
-        return _rotated(self.rotations, self.numbers, x)
+        found = self.factor.solve(_rotated(self.rotations.mT, self.numbers, right), rtol)
+        return _rotated(self.rotations, self.numbers, found)
 
 
 # One explicit signature each: numba's cache can mix up the machine code of several signatures of a

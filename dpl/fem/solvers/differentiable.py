@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from dpl.fem.linear.krylov import Map, solve_unsymmetric
 from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status
+from dpl.fem.solvers.solution import Load, Status
 
 ADJOINT_TOL = 1e-12  # relative residual of an adjoint solve with an unsymmetric tangent [-]
 
@@ -41,43 +41,28 @@ class DifferentiableSolve:
         """Return displacements over L, (B, N, D) [-], float64.
 
         Args:
-            load: The load; differentiable in `force`, (B, N, D) [-], and `parameters`, (B, P).
+            load: The load, on the CPU; differentiable in `force`, (B, N, D) [-], and `parameters`,
+                (B, P).
             guess: Displacement to start from, (B, N, D) [-]; zero if left out.
 
         Raises:
-            ValueError: A load of the batch has no solution (see `solution`), or the load is not on
-                the CPU.
-            SingularMatrix: In the backward pass, if the tangent at a solution is singular, that is
-                at a critical load.
+            ValueError: A load of the batch has no solution.
+            SingularMatrix: In the backward pass, at a critical load: the tangent is singular.
         """
         if load.force.device.type != "cpu":
             raise ValueError(f"load.force is on {load.force.device} and must be on the cpu")
-        return _Equilibrium.apply(load.force.double(), load.parameters, guess, self)
+        return _Equilibrium.apply(load.force.double(), load.parameters, guess, self.newton)
 
-    def solution(self, load: Load, *, guess: Tensor | None = None) -> Solution:
-        """Return Newton's solution, without derivatives."""
-        with torch.no_grad():
-            *_, last = self.newton.iterate(load, guess=guess)
-        return last
 
-    def adjoint(self, displacement: Tensor, parameters: Tensor) -> Map:
-        """Return the function g -> K(u)^-T g, (n,) to (n,).
-
-        Args:
-            displacement: u, (1, N, D) [-].
-            parameters: Values of `Problem.parameter_ranges`, (1, P).
-
-        Raises:
-            SingularMatrix: The tangent is singular.
-        """
-        linear = self.newton.linear_solver
-        system = self.newton.problem.with_parameters(parameters).linearise(displacement)
-        values = system.tangent[0].numpy()
-        factor = linear.tangent_backend.factorise(values)
-        if system.skew is None:
-            return factor.solve
-        transposed = linear.problem.pattern, values, -system.skew[0].numpy()
-        return partial(solve_unsymmetric, *transposed, factor.apply, rtol=ADJOINT_TOL)
+def _adjoint(newton: Newton, displacement: Tensor, parameters: Tensor) -> Map:
+    """Return the function g -> K(u)^-T g, (n,) to (n,), at u (1, N, D) and parameters (1, P)."""
+    system = newton.problem.with_parameters(parameters).linearise(displacement)
+    values = system.tangent[0].numpy()
+    factor = newton.linear_solver.tangent_backend.factorise(values)
+    if system.skew is None:
+        return factor.solve
+    transposed = newton.problem.pattern, values, -system.skew[0].numpy()
+    return partial(solve_unsymmetric, *transposed, factor.apply, rtol=ADJOINT_TOL)
 
 
 class _Equilibrium(torch.autograd.Function):
@@ -85,37 +70,29 @@ class _Equilibrium(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        force: Tensor,
-        parameters: Tensor,
-        guess: Tensor | None,
-        parent: DifferentiableSolve,
+        ctx: Any, force: Tensor, parameters: Tensor, guess: Tensor | None, newton: Newton
     ) -> Tensor:
-        guess = None if guess is None else guess.detach()
-        parameters = parameters.detach()
-        load = Load(force.detach(), torch.ones(len(force), dtype=torch.float64), parameters)
-        answer = parent.solution(load, guess=guess)
+        parameters, young = parameters.detach(), torch.ones(len(force), dtype=torch.float64)
+        load = Load(force.detach(), young, parameters)
+        *_, answer = newton.iterate(load, guess=None if guess is None else guess.detach())
         if not answer.converged.all():
             lost = (~answer.converged).nonzero().flatten().tolist()
             states = ", ".join(f"load {k}: {Status(int(answer.status[k]))}" for k in lost)
             raise ValueError(f"no equilibrium to differentiate; of {len(force)} loads, {states}")
-        ctx.parent, ctx.parameters, ctx.adjoints = parent, parameters, None
+        ctx.newton, ctx.parameters, ctx.adjoints = newton, parameters, None
         ctx.save_for_backward(answer.displacement)
         return answer.displacement
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
-        problem, (displacement,) = ctx.parent.newton.problem, ctx.saved_tensors
+        problem, (displacement,) = ctx.newton.problem, ctx.saved_tensors
         if ctx.adjoints is None:  # kept: each row of a Jacobian needs them
             parameters = ctx.parameters.expand(len(displacement), -1)
             pairs = zip(displacement.split(1), parameters.split(1), strict=True)
-            ctx.adjoints = [ctx.parent.adjoint(*pair) for pair in pairs]
-        solved = [
-            problem.extend(adjoint(problem.restrict(one)))
-            for adjoint, one in zip(ctx.adjoints, gradient, strict=True)
-        ]
-        adjoint_field = torch.stack(solved)
+            ctx.adjoints = [_adjoint(ctx.newton, *pair) for pair in pairs]
+        pairs = zip(ctx.adjoints, map(problem.restrict, gradient), strict=True)
+        adjoint_field = torch.stack([problem.extend(solve(right)) for solve, right in pairs])
         if not ctx.needs_input_grad[1]:
             return adjoint_field, None, None, None
         with torch.enable_grad():

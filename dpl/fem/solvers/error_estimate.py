@@ -4,10 +4,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.blas import dnrm2  # without under- or overflow of squares
 from torch import Tensor
 
 from dpl.fem.linear.interface import Array
-from dpl.fem.linear.krylov import binary_unit, krylov_steps, scaled_norm
+from dpl.fem.linear.krylov import binary_unit, krylov_steps
 from dpl.fem.problem import Evaluation
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
@@ -23,17 +24,11 @@ DIFFERENCE = 1e-5  # change of u, relative to u, by which products are computed 
 
 
 class ErrorEstimate(NamedTuple):
-    """Estimated error of a displacement.
+    """Estimated error of a displacement."""
 
-    Attributes:
-        error: Estimated relative error [-].
-        correction: The correction behind it, (1, N, D) [-]; None if there is none.
-        is_indefinite: The tangent has negative curvature near equilibrium.
-    """
-
-    error: float
-    correction: Tensor | None = None
-    is_indefinite: bool = False
+    error: float  # estimated relative error [-]
+    correction: Tensor | None = None  # the correction behind it, (1, N, D) [-]
+    is_indefinite: bool = False  # the tangent has negative curvature near equilibrium
 
 
 def estimate_error(
@@ -70,8 +65,7 @@ def estimate_error(
 
     Args:
         solver: Linear solver of the body with the factor of K(0).
-        load: The load, B = 1.
-        displacement: u, (1, N, D) [-].
+        load, displacement: The load, B = 1, and u, (1, N, D) [-].
         evaluation: Internal force and min det F at u, if known.
         products: Largest number of steps; with 0 the estimate is ||M R|| / ||u||, too small where
             the load softens the body.
@@ -79,30 +73,29 @@ def estimate_error(
     problem = solver.problem.with_parameters(load.parameters)
     internal, volume = evaluation or problem.evaluate(displacement)
     right = problem.restrict((load.force - internal)[0])
-    size = scaled_norm(displacement.numpy().ravel())
+    size = dnrm2(displacement.numpy().ravel())
     if not bool(volume > 0) or not np.isfinite(right).all():
         return ErrorEstimate(math.inf)
     inverse = solver.reference.corotational.at(displacement)
 
     def product(direction: Array) -> Array:
-        length = DIFFERENCE * size / scaled_norm(direction)
+        length = DIFFERENCE * size / dnrm2(direction)
         moved = problem.evaluate(displacement + length * problem.extend(direction)[None])
         return problem.restrict((moved.internal - internal)[0]) / length
 
     unit = binary_unit(right)
     steps = krylov_steps(product, lambda part: inverse.solve(part, RTOL), right / unit)
-    first = 0.0
     for k, step in enumerate(steps):
         made = step.solution if k else step.preconditioned
         correction = problem.extend(unit * made)[None]
-        first = first if k else scaled_norm(step.preconditioned)
-        ritz = step.ritz
-        if not ritz > 0:
+        if k == 0:
+            first = dnrm2(made)
+        if not (ritz := step.ritz) > 0:
             is_near = bool(problem.relative_residual_of(internal, load.force) < NEAR)
             error = math.inf if is_near else DOUBT * unit * first / size
             return ErrorEstimate(error, correction, is_indefinite=is_near)
-        least, length = min(ritz, 1.0), scaled_norm(step.solution)
-        rest = scaled_norm(step.preconditioned) / least
+        least, length = min(ritz, 1.0), dnrm2(step.solution)
+        rest = dnrm2(step.preconditioned) / least
         if size == 0 or k == products or rest <= REST * length:
             break
     if k and unit * (length + rest) > LINEAR * size:
@@ -110,7 +103,7 @@ def estimate_error(
         left = problem.restrict((load.force - better.internal)[0]) / unit
         if not bool(better.volume_ratio > 0):
             return ErrorEstimate(math.inf, correction)
-        rest = max(rest, scaled_norm(inverse.solve(left, RTOL)) / least)
+        rest = max(rest, dnrm2(inverse.solve(left, RTOL)) / least)
     distance = (2 - least) * (length + rest)
     if size == 0:
         return ErrorEstimate(math.inf if distance else 0.0, correction)

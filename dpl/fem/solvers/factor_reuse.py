@@ -52,13 +52,12 @@ class TangentSolver:
         definite: bool = False,
         skew: Array | None = None,
     ) -> Array:
-        """Return K(u)^-1 of a right-hand side (n,), to a relative residual.
+        """Return K(u)^-1 of a right-hand side (n,), to a relative residual `rtol`.
 
         Args:
             tangent: Entries of K(u), (nnz,); None: K(0).
             u: Displacement, (1, N, D) [-].
-            right: Right-hand side, (n,).
-            rtol: Relative residual at which conjugate gradients stop [-].
+            right, rtol: As of `conjugate_gradients`.
             near: Whether u is near enough to the last iterate to reuse its factor.
             definite: Refuse an indefinite tangent.
             skew: Entries of (K - K^T) / 2, (nnz,); `tangent` is then the symmetric part. None: K is
@@ -89,14 +88,14 @@ class TangentSolver:
         self.factorisations += 1
         factorise = self.backend.factorise
         if definite:
-            factorise = getattr(self.backend, "factorise_definite", factorise)
-        self._factor = factorise(tangent)
-        if definite and self._factor.negative_pivots:
+            factorise = getattr(self.backend, "definite", factorise)
+        found = factorise(tangent)
+        if found is None or (definite and found.negative_pivots):
             raise SingularMatrix("the tangent is indefinite")
+        self._factor = found
         if skew is not None:
-            apply = self._factor.apply
-            return solve_unsymmetric(self._pattern, tangent, skew, apply, right, rtol)
-        return self._factor.solve(right, rtol)
+            return solve_unsymmetric(self._pattern, tangent, skew, found.apply, right, rtol)
+        return found.solve(right, rtol)
 
     def _preconditioner(self, u: Tensor, *, near: bool) -> Factor | None:
         """Return the factor for conjugate gradients on K(u); None: K(u) is factorised."""
@@ -115,40 +114,35 @@ class TangentSolver:
         The tangent there is factorised only if the last factor has negative pivots or its backend
         does not count them, or if a Ritz value shows an eigenvalue far below the stale factor's.
         """
-        if self._factor is None or self._factor is self._corotated:
+        factor, known = self._factor, 0
+        if factor is None or factor is self._corotated:
             return UNKNOWN
-        if self._factor is self._rest:
-            known = self._factor.stability()
+        if factor is self._rest:
+            known = factor.stability
             suspect = known > 0
         else:
-            known = 0
-            suspect = self._factor.negative_pivots != 0 or self._ritz_value_is_small()
+            suspect = factor.negative_pivots != 0
+        if not suspect and self._tangent is not None:  # which a stale factor has solved
+            with suppress(SingularMatrix):
+                least = smallest_ritz_value(self._tangent, factor.apply, self._pattern.size)
+                suspect = least < MIN_RITZ_VALUE
         if not suspect:
             return known
         self.factorisations += 1
         self._factor = None
         return stability_at(self.linear_solver.problem, self.backend, u)
 
-    def _ritz_value_is_small(self) -> bool:
-        """Return True if the last tangent, solved with a stale factor, may be indefinite."""
-        if self._factor is None or self._tangent is None:
-            return False
-        with suppress(SingularMatrix):
-            value = smallest_ritz_value(self._tangent, self._factor.apply, self._pattern.size)
-            return value < MIN_RITZ_VALUE
-        return False
-
 
 def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> int:
-    """Return the number of negative eigenvalues of a tangent, see `Factor.stability`.
+    """Return the number of negative eigenvalues of K(u), u (1, N, D), see `Factor.stability`.
 
-    The tangent is that at a displacement (1, N, D). A singular one counts as unstable. Under a
-    follower load without potential a positive definite symmetric part is sufficient for stability.
-    It is not necessary: otherwise nothing is known.
+    A singular tangent counts as unstable. Under a follower load without potential a positive
+    definite symmetric part is sufficient for stability. It is not necessary: otherwise nothing is
+    known.
     """
     tangent = problem.linearise(displacement).tangent
     try:
-        found = backend.factorise(tangent[0].numpy()).stability()
+        found = backend.factorise(tangent[0].numpy()).stability
     except SingularMatrix:  # at the critical load itself
         found = 1
     return found if problem.has_potential or found <= 0 else UNKNOWN
@@ -157,14 +151,10 @@ def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> in
 def forcing_term(residual: float, previous: float, *, tol: float, corotational: bool) -> float:
     """Return the relative residual at which the linear solve of a Newton step may stop [-].
 
-    It is as large as the convergence of Newton's method allows.
+    It is as large as the convergence of Newton's method allows. The residuals are relative, that of
+    the last state NaN if there is none. With `corotational` the first step may be inexact.
 
     Source: Eisenstat, Walker (1996), SIAM J. Sci. Comput. 17, choice 2.
-
-    Args:
-        residual, previous: Relative residuals of this state and of the last [-]; NaN if none.
-        tol: Relative residual of a solution [-].
-        corotational: Whether the first step from a state may be inexact.
     """
     enough = 0.1 * tol / residual if residual > 0 else 0.0
     first = 1e-3 if corotational else 0.0

@@ -4,14 +4,17 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.linear.backends import BackendFactory, make_backend, select_backend
+from dpl.fem.linear.backends import BackendFactory, make_backend
 from dpl.fem.linear.banded import BandedFactor
-from dpl.fem.linear.interface import Backend, Factor
+from dpl.fem.linear.interface import Backend, Factor, SymmetricProduct
+from dpl.fem.linear.krylov import Map, krylov_steps, smallest_ritz_value
 from dpl.fem.parity import Parities
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotationalPreconditioner
@@ -20,6 +23,7 @@ from dpl.fem.solvers.solution import Load, Solution, check_force, check_tol, eva
 from dpl.fem.symmetry import SymmetryGroup, symmetries
 
 MAX_CLONES = 4  # solvers of other parameters that are kept with their factors
+ENOUGH, MAX_COUNT = 1e-3, 50  # relative residual and largest number of steps that are counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +36,14 @@ class LinearSolver:
             below 1.
         linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
         parent: Solver of the same mesh with other parameters, whose backends are used.
+        approximate: Factor of K(0) in the accuracy of float32, if there is one already.
     """
 
     problem: Problem
     tol: float = 1e-8
     linear: str | BackendFactory = "auto"
     parent: "LinearSolver | None" = field(default=None, repr=False)
+    approximate: Factor | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         check_tol(self.tol)
@@ -52,7 +58,31 @@ class LinearSolver:
     @cached_property
     def corotational(self) -> CorotationalPreconditioner:
         """Preconditioner from `float32_factor`."""
-        return CorotationalPreconditioner(self.problem, self.float32_factor)
+        if self._twin:
+            return self._twin.corotational
+        return CorotationalPreconditioner(self.problem.discretisation, self.float32_factor)
+
+    def count_iterations(self, displacement: Tensor) -> int:
+        """Return the conjugate gradient steps for K(u), u (1, N, D), with the corotated factor.
+
+        They reduce a random right-hand side to `ENOUGH`; more than `MAX_COUNT` are not counted.
+        """
+        right = np.random.default_rng(0).standard_normal(self.problem.pattern.size)
+        steps = islice(krylov_steps(*self._preconditioned(displacement), right), MAX_COUNT)
+        enough = ENOUGH * np.linalg.norm(right)
+        small = (k for k, step in enumerate(steps) if np.linalg.norm(step.residual) <= enough)
+        return next(small, MAX_COUNT)
+
+    def smallest_ritz_value(self, displacement: Tensor) -> float:
+        """Return the smallest Ritz value of the corotated inverse times K(u), u (1, N, D) [-]."""
+        maps = self._preconditioned(displacement)
+        return smallest_ritz_value(*maps, self.problem.pattern.size)
+
+    def _preconditioned(self, displacement: Tensor) -> tuple[Map, Map]:
+        """Return the products with the tangent and with its corotated preconditioner."""
+        values = self.problem.linearise(displacement).tangent[0].numpy()
+        product = SymmetricProduct(self.problem.pattern, values)
+        return product, self.corotational.at(displacement).apply
 
     @cached_property
     def float32_factor(self) -> Factor:
@@ -63,13 +93,15 @@ class LinearSolver:
         """
         if self._twin:
             return self._twin.float32_factor
+        if self.approximate is not None:
+            return self.approximate
         factor = self.factor
         if not isinstance(factor, BandedFactor):
             return factor
         is_reference = self.parent is None or self.problem is self.parent.problem.reference
         if is_reference and len(Parities.of(self.symmetries, self.problem.shape[1]).members) > 1:
             return ParityFactor.of(self.problem, self.symmetries)
-        return factor.to_float32()
+        return replace(factor, storage=factor.storage.astype(np.float32))
 
     @property
     def _twin(self) -> "LinearSolver | None":
@@ -85,30 +117,27 @@ class LinearSolver:
     @cached_property
     def backend(self) -> Backend:
         """Backend of K(0), whose factor solves for many loads."""
-        return self.parent.backend if self.parent else self._make_backend(many_rhs=True)
+        if self.parent:
+            return self.parent.backend
+        problem = self.problem
+        return make_backend(problem.pattern, self.linear, problem.near_null, many_rhs=True)
 
     @cached_property
     def tangent_backend(self) -> Backend:
         """Backend of the tangents far from rest, each of which is factorised for few solves."""
-        return self.parent.tangent_backend if self.parent else self._make_backend(many_rhs=False)
-
-    def _make_backend(self, *, many_rhs: bool) -> Backend:
-        pattern, modes = self.problem.pattern, self.problem.near_null
-        name = select_backend(self.linear, pattern, modes, many_rhs=many_rhs)
-        return make_backend(pattern, name, modes)
+        if self.parent:
+            return self.parent.tangent_backend
+        return make_backend(self.problem.pattern, self.linear, self.problem.near_null)
 
     def with_parameters(self, parameters: Tensor) -> "LinearSolver":
-        """Return the solver of the body with other parameters, see `Problem.with_parameters`.
-
-        The solvers of the last `MAX_CLONES` bodies are kept.
-        """
+        """Return the solver of `Problem.with_parameters`; the last `MAX_CLONES` are kept."""
         problem = self.problem.with_parameters(parameters)
         if problem is self.problem:
             return self
         if problem not in self._clones:
             if len(self._clones) >= MAX_CLONES:
                 self._clones.pop(next(iter(self._clones)))
-            self._clones[problem] = replace(self, problem=problem, parent=self)
+            self._clones[problem] = self._with_problem(problem)
         return self._clones[problem]
 
     def forget_clones(self) -> None:
@@ -123,20 +152,16 @@ class LinearSolver:
     def reference(self) -> "LinearSolver":
         """The linear solver of the reference body, see `Problem.reference`."""
         problem = self.problem.reference
-        return self if problem is self.problem else replace(self, problem=problem, parent=self)
+        return self if problem is self.problem else self._with_problem(problem)
+
+    def _with_problem(self, problem: Problem) -> "LinearSolver":
+        return replace(self, problem=problem, parent=self, approximate=None)
 
     def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the linear solution.
-
-        Raises:
-            ValueError: The force does not fit the body, see `check_force`.
-        """
+        """Yield the linear solution; a force that does not fit the body is a ValueError."""
         check_force(self.problem, load)
-        start = time.perf_counter()
-        members = [
-            self.with_parameters(one.parameters).solve(one.force[0]) for one in load.unbatch()
-        ]
-        u = torch.stack(members)
+        start, members = time.perf_counter(), load.unbatch()
+        u = torch.stack([self.with_parameters(f.parameters).solve(f.force[0]) for f in members])
         seconds = (time.perf_counter() - start) / len(u)
         yield evaluate_solution(self.problem, u, load, self.tol, iterations=1, seconds=seconds)
 

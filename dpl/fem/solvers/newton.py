@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dpl.fem.linear.backends import BackendFactory, select_backend
 from dpl.fem.linear.interface import UNKNOWN, SingularMatrix
+from dpl.fem.options import check_options, option
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.factor_reuse import TangentSolver, forcing_term, stability_at
 from dpl.fem.solvers.linear import LinearSolver
@@ -36,9 +37,6 @@ class Newton:
     or may have had some: a solution within 1e-4 of a critical load may pass as stable.
 
     Source: Wriggers (2008), Nonlinear Finite Element Methods, sections 5.1 and 5.3.
-
-    Raises:
-        ValueError: An attribute is out of range, or the backend is not installed.
 
     Attributes:
         problem: The body.
@@ -67,28 +65,21 @@ class Newton:
 
     problem: Problem
     tol: float = 1e-8
-    max_iter: int = 15
-    max_total_iter: int = 400
-    min_load_step: float = 2.0**-10
-    intermediate_tol: float = 1e-2
-    min_detF_ratio: float = 0.2
+    max_iter: int = option("", default=15, least=1)
+    max_total_iter: int = option("", default=400, least=1)
+    min_load_step: float = option("", default=2.0**-10, above=0, below=1)
+    intermediate_tol: float = option("", default=1e-2, above=0, below=1)
+    min_detF_ratio: float = option("", default=0.2, above=0, below=1)
     linear: str | BackendFactory = "auto"
     mixed_integration: bool = True
-    factor_reuse_tol: float = 0.1
+    factor_reuse_tol: float = option("", default=0.1, least=0)
     corotational: bool = False
     abandon_indefinite_guess: bool = False
     linear_solver: LinearSolver = field(default=None, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         check_tol(self.tol)
-        for name in ("intermediate_tol", "min_detF_ratio", "min_load_step"):
-            if not 0 < getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
-        if not 0 <= self.factor_reuse_tol < math.inf:
-            raise ValueError(f"factor_reuse_tol = {self.factor_reuse_tol} must be 0 or more")
-        for name in ("max_iter", "max_total_iter"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)} must be 1 or more")
+        check_options(self)
         select_backend(self.linear)
         given = self.linear_solver
         if given is None or given.problem is not self.problem or given.linear != self.linear:
@@ -102,11 +93,8 @@ class Newton:
         ends with its last equilibrium under a part of the load.
 
         Args:
-            load: The load.
+            load: The load; a force that does not fit the body is a ValueError.
             guess: Displacement to start from, (B, N, D) [-]; zero where it inverts an element.
-
-        Raises:
-            ValueError: The force does not fit the body, see `check_force`.
         """
         check_force(self.problem, load)
         members = load._replace(force=self.problem.acting(load.force)).unbatch()
@@ -137,8 +125,12 @@ class Newton:
         one, supports = torch.ones(1, dtype=force.dtype), self.problem.prescribed[None]
         internal = self.problem.force_at_rest[None]
         state = base = _State(zero, internal, one, supports, {})  # at rest, needs no evaluation
-        if (start := self._initial(force, guess)) is not None:
-            state, run.from_guess = start, True
+        is_loaded = force.any() or self.problem.is_loaded_at_rest
+        if guess is not None and guess.any() and is_loaded:
+            u = torch.where(self.problem.free, guess, self.problem.prescribed)
+            start = _State(u, *self.problem.evaluate(u), zero, {})
+            if start.volume_ratio > 0:
+                state, run.from_guess = start, True
         yield self._report(state, force, run)
         while not self._is_balanced(state, force, 1.0, self.tol):
             steps, target = run.steps, run.steps.target
@@ -187,19 +179,9 @@ class Newton:
                 return
 
     def _solve(
-        self,
-        state: "_State",
-        force: Tensor,
-        factor: float,
-        run: "_Run",
-        rtol: float,
-        *,
-        near: bool,
+        self, state: "_State", force: Tensor, factor: float, run: "_Run", rtol: float, *, near: bool
     ) -> Tensor:
-        """Return the full Newton step (1, N, D) under `factor` times a load.
-
-        It contains the step of the supports.
-        """
+        """Return the full Newton step (1, N, D), also of supports, under part of a load."""
         problem, u = self.problem.under(factor), state.displacement
         internal, tangent, skew = self._internal(state, factor), None, None
         if u.any():
@@ -220,7 +202,7 @@ class Newton:
         bound = self.min_detF_ratio * min(float(state.volume_ratio), 1.0)
         for length in (0.5**k for k in range(halvings + 1)):
             u = state.displacement + length * update
-            new = self._evaluate(u, (1 - length) * state.support_step)
+            new = _State(u, *self.problem.evaluate(u), (1 - length) * state.support_step, {})
             if new.volume_ratio > bound:
                 break
         else:
@@ -228,18 +210,6 @@ class Newton:
         if self.mixed_integration and self.problem.material.has_response:
             new = new._replace(gap=self.problem.update_strain_gap(state.gap, length, update, u))
         return new
-
-    def _initial(self, force: Tensor, guess: Tensor | None) -> "_State | None":
-        """Return the state of a guess; None where it is zero, inverted or there is no load."""
-        loaded = force.any() or self.problem.is_loaded_at_rest
-        if guess is None or not guess.any() or not loaded:
-            return None
-        u = torch.where(self.problem.free, guess, self.problem.prescribed)
-        start = self._evaluate(u, torch.zeros_like(force))
-        return start if start.volume_ratio > 0 else None
-
-    def _evaluate(self, displacement: Tensor, support_step: Tensor) -> "_State":
-        return _State(displacement, *self.problem.evaluate(displacement), support_step, {})
 
     def _residual(self, state: "_State", force: Tensor, factor: float) -> float:
         """Return the relative residual under `factor` times a load, evaluated once."""
@@ -299,19 +269,11 @@ class Newton:
 
 @dataclass
 class LoadStepping:
-    """Load factors of an incremental solution: a failed step is halved, the next one doubled.
+    """Load factors of an incremental solution: a failed step is halved, the next one doubled."""
 
-    Source: Wriggers (2008), Nonlinear Finite Element Methods, section 5.3.
-
-    Attributes:
-        min_step: Load step below which the solution is given up [-].
-        factor: Largest load factor for which an equilibrium is known [-].
-        step: Load step that is tried next [-].
-    """
-
-    min_step: float
-    factor: float = 0.0
-    step: float = 1.0
+    min_step: float  # load step below which the solution is given up [-]
+    factor: float = 0.0  # largest load factor for which an equilibrium is known [-]
+    step: float = 1.0  # load step that is tried next [-]
 
     @property
     def target(self) -> float:
@@ -333,25 +295,15 @@ class LoadStepping:
 
 
 class _State(NamedTuple):
-    """An evaluated iterate.
+    """An evaluated iterate."""
 
-    Attributes:
-        displacement: u, (1, N, D) [-].
-        internal: f_int(u) under the whole follower loads, (1, N, D) [-].
-        volume_ratio: min det F, (1,) [-].
-        support_step: Displacement that the next step has to add at the supports, (1, N, D) [-].
-        residuals: Relative residuals by load factor.
-        gap: Strain gap of the mixed integration points, see `Problem.update_strain_gap`.
-        previous: Relative residual before that step [-].
-    """
-
-    displacement: Tensor
-    internal: Tensor
-    volume_ratio: Tensor
-    support_step: Tensor
-    residuals: dict[float, float]
-    gap: Any = None
-    previous: float = math.inf
+    displacement: Tensor  # u, (1, N, D) [-]
+    internal: Tensor  # f_int(u) under the whole follower loads, (1, N, D) [-]
+    volume_ratio: Tensor  # min det F, (1,) [-]
+    support_step: Tensor  # displacement that the next step adds at the supports, (1, N, D) [-]
+    residuals: dict[float, float]  # relative residuals by load factor
+    gap: Any = None  # strain gap of the mixed integration points, see `update_strain_gap`
+    previous: float = math.inf  # relative residual before that step [-]
 
 
 @dataclass

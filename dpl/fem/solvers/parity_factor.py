@@ -12,16 +12,10 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import block_diag, coo_array, csr_array
+from scipy.sparse import block_diag, coo_array, csr_array, dia_array
 from torch import Tensor
 
-from dpl.fem.linear.condensation import (
-    Condensed,
-    condense,
-    condensed_layers,
-    condensed_solves,
-    solve_layers,
-)
+from dpl.fem.linear.condensation import Condensed, condense, condensed_solves
 from dpl.fem.linear.interface import Array, Factor, full_matrix
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
@@ -30,17 +24,11 @@ from dpl.fem.symmetry import SymmetryGroup
 
 
 class OrbitForm(NamedTuple):
-    """K(0) of a body by parity: equations of one value of each of m orbits, for M parities.
+    """K(0) of a body by parity: equations of one value of each of m orbits, for M parities."""
 
-    Attributes:
-        parities: Symmetries that define the parities.
-        orbits: Degrees of freedom of each orbit.
-        points: Position of the first one, (m, D).
-    """
-
-    parities: Parities
-    orbits: SignedOrbits
-    points: NDArray[np.float64]
+    parities: Parities  # symmetries that define the parities
+    orbits: SignedOrbits  # degrees of freedom of each orbit
+    points: NDArray[np.float64]  # position of the first one, (m, D)
 
     @classmethod
     def of(cls, problem: Problem, group: SymmetryGroup) -> Self:
@@ -55,25 +43,31 @@ class OrbitForm(NamedTuple):
         return self.orbits.by_parity(force, self.parities)
 
     def matrices(self, problem: Problem) -> list[csr_array]:
-        """Return C^T K(0) C, (m, m), of the fields C of each parity; see `of`."""
+        """Return C^T K(0) C, (m, m), of the fields C of each parity, one for each orbit.
+
+        The field of an orbit that the parity does not allow is zero; it gets a one on the diagonal.
+        """
         whole = full_matrix(problem.pattern, problem.stiffness_at_rest().numpy())
-        return [_block(whole, self.orbits, factors) for factors in self.parities.characters]
+        orbits, count, parts = self.orbits, len(self.orbits.weight), []
+        shape = whole.shape[0], count
+        for characters in self.parities.characters:
+            values = (characters[:, None] * orbits.sign * orbits.weight).flatten().numpy()
+            columns = np.tile(np.arange(count), len(characters))
+            places = orbits.images.flatten().numpy(), columns
+            fields = coo_array((values, places), shape=shape).tocsr()
+            is_missing = np.asarray(fields.power(2).sum(axis=0)).ravel() < 1e-6
+            ones = dia_array((is_missing[None].astype(float), [0]), shape=(count, count))
+            parts.append((fields.T @ whole @ fields + ones).tocsr())
+        return parts
 
 
 @dataclass(frozen=True, eq=False)
 class ParityFactor(Factor):
-    """Nested condensation of K(0) for one value of each of m orbits, M parities.
+    """Nested condensation of K(0) for one value of each of m orbits, M parities."""
 
-    Attributes:
-        blocks: Blocks of the parities in float32.
-        orbits: Degrees of freedom of each orbit.
-        characters: Factor of each parity under each symmetry, (M, M).
-        negative_pivots: 0.
-    """
-
-    blocks: Condensed
-    orbits: SignedOrbits
-    characters: Tensor
+    blocks: Condensed  # blocks of the parities in float32
+    orbits: SignedOrbits  # degrees of freedom of each orbit
+    characters: Tensor  # factor of each parity under each symmetry, (M, M)
     negative_pivots: int = 0
 
     @classmethod
@@ -99,18 +93,6 @@ class ParityFactor(Factor):
         x[images] = signs * (characters.T @ solved)
         return x
 
-    def solve_many(self, right: Array, rtol: float = 1e-12) -> Array:
-        """Return the solutions, (k, n), in the accuracy of float32, see `Factor.solve_many`."""
-        size = np.abs(right).max(axis=1, keepdims=True, initial=0)  # of order one in float32
-        size[size == 0] = 1
-        images, signs, scales, characters = self._arrays
-        parts = torch.from_numpy(characters @ (scales * (right / size)[:, images]))  # (k, M, m)
-        layers = condensed_layers(self.blocks, "cpu")
-        solved = solve_layers(layers, parts.transpose(0, 1).float()).transpose(0, 1).numpy()
-        x = np.empty_like(right)
-        x[:, images] = signs * (characters.T @ solved)
-        return x * size
-
     @cached_property
     def _arrays(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
         """Images and signs of the orbits, signs times weights, (M, m), and the characters."""
@@ -118,34 +100,12 @@ class ParityFactor(Factor):
         return images, signs, signs * weights, self.characters.numpy()
 
 
-def _block(whole: csr_array, orbits: SignedOrbits, characters: Tensor) -> csr_array:
-    """Return C^T K C, (m, m), of the fields C of one parity, one for each orbit.
-
-    The field of an orbit that the parity does not allow is zero; it gets a one on the diagonal.
-    """
-    count = len(orbits.weight)
-    values = characters[:, None] * orbits.sign * orbits.weight
-    columns = np.tile(np.arange(count), len(characters))
-    places = orbits.images.flatten().numpy(), columns
-    shape = whole.shape[0], count
-    fields = coo_array((values.flatten().numpy(), places), shape=shape).tocsr()
-    squares = np.asarray(fields.power(2).sum(axis=0)).ravel()
-    missing = np.flatnonzero(squares < 1e-6)
-    ones = coo_array((np.ones(len(missing)), (missing, missing)), shape=(count, count))
-    return (fields.T @ whole @ fields + ones).tocsr()
-
-
 class TermMatrices(NamedTuple):
-    """Terms of K(0) by parity as sparse matrices of one structure: n equations of all parities.
+    """Terms of K(0) by parity as sparse matrices of one structure: n equations of all parities."""
 
-    Attributes:
-        first_entry, columns: CSR structure, (n + 1,) and (nnz,).
-        entries: Entries of the T terms and of the springs, (T + 1, nnz).
-    """
-
-    first_entry: NDArray[np.int32]
-    columns: NDArray[np.int32]
-    entries: Array
+    first_entry: NDArray[np.int32]  # of each row, (n + 1,)
+    columns: NDArray[np.int32]  # of the entries, (nnz,)
+    entries: Array  # entries of the T terms and of the springs, (T + 1, nnz)
 
     @classmethod
     def of(cls, terms: StiffnessTerms, form: OrbitForm) -> Self:
@@ -154,7 +114,12 @@ class TermMatrices(NamedTuple):
         every = [block_diag(form.matrices(body), format="csr") for body in bodies]
         structure = csr_array(sum(abs(one) for one in every))
         structure.sort_indices()
-        entries = np.stack([_entries(one, structure) for one in every])
+        size, entries = structure.shape[1], np.zeros((len(every), structure.nnz))
+        rows = np.repeat(np.arange(size), np.diff(structure.indptr))
+        for own, one in zip(entries, every, strict=True):
+            i, j = one.tocoo().coords
+            places = np.searchsorted(rows * size + structure.indices, i * size + j.astype(np.int64))
+            own[:] = np.bincount(places, one.data, structure.nnz)
         entries[-1] -= terms.node[0].numpy() @ entries[:-1]
         return cls(structure.indptr, structure.indices, entries)
 
@@ -172,14 +137,3 @@ class TermMatrices(NamedTuple):
         entries = np.zeros((len(self.entries), *columns.shape))
         entries[:, rows, place] = self.entries
         return torch.from_numpy(columns), torch.from_numpy(entries)
-
-
-def _entries(matrix: csr_array, structure: csr_array) -> Array:
-    """Return the entries of a matrix in the order of a structure that contains its own."""
-    size = structure.shape[1]
-    found = matrix.tocoo()
-    rows = np.repeat(np.arange(structure.shape[0]), np.diff(structure.indptr))
-    places = np.searchsorted(
-        rows * size + structure.indices, found.coords[0] * size + found.coords[1].astype(np.int64)
-    )
-    return np.bincount(places, found.data, structure.nnz).astype(np.float64)

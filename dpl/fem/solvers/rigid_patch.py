@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dpl.fem.linear.interface import Array, Factor
 from dpl.fem.mesh.regions import Region, nodes_in
 from dpl.fem.problem import Evaluation, Problem
-from dpl.fem.solvers.corotational import CorotationalPreconditioner
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.newton import Newton
 
@@ -24,12 +24,7 @@ FACING = 0.966  # smallest cosine, of 15 degrees, between a facet's normal and t
 
 
 class Wrench(NamedTuple):
-    """Resultant of the forces of a gripper on a patch.
-
-    Attributes:
-        force: (D,) [-].
-        moment: About the centre of the displaced patch, (3,), in 2D (1,) [-].
-    """
+    """Force (D,) [-] of a gripper, and moment (3,), in 2D (1,) [-], about the displaced centre."""
 
     force: Tensor
     moment: Tensor
@@ -69,16 +64,14 @@ class RigidPatch:
             ValueError: The region has no free node of the boundary, no direction is held, or a
                 sliding patch has no flat part.
         """
-        problem = linear.problem
-        if isinstance(region, np.ndarray):
-            inside = region
-            if inside.dtype != bool or inside.shape != problem.shape[:1]:
-                raise ValueError(
-                    f"region: an array of {inside.dtype}, {inside.shape}, must be a mask of bool, "
-                    f"({problem.shape[0]},)"
-                )
-        else:
-            inside = nodes_in(region, problem.basis, problem.length, problem.origin)
+        problem, inside = linear.problem, region
+        if not isinstance(inside, np.ndarray):
+            inside = nodes_in(inside, problem.basis, problem.length, problem.origin)
+        elif inside.dtype != bool or inside.shape != problem.shape[:1]:
+            raise ValueError(
+                f"region: an array of {inside.dtype}, {inside.shape}, must be a mask of bool, "
+                f"({problem.shape[0]},)"
+            )
         nodes, held_axes = torch.from_numpy(inside) & problem.boundary, list(directions)
         if sliding:
             nodes, axis = flat_part(problem, nodes)
@@ -100,17 +93,11 @@ class RigidPatch:
         """Mask of the held nodes, (N,)."""
         return self.held.any(dim=1)
 
-    @cached_property
-    def _dofs(self) -> Tensor:
-        """Numbers of the held degrees of freedom, (m,)."""
-        return self.held.flatten().nonzero()[:, 0]
-
     def displacement(self, translation: Sequence[float], rotation: Sequence[float]) -> Tensor:
         """Return the displacement of the held degrees of freedom, (m,) [-].
 
-        Args:
-            translation: Displacement of the mean of the held nodes, (D,) [-].
-            rotation: Rotation vector about it, (3,), in 2D the angle, (1,) [rad].
+        The translation (D,) [-] is that of the mean of the held nodes. The rotation vector about it
+        is (3,), in 2D the angle, (1,) [rad].
         """
         points = self.problem.points[self.nodes]
         arms = points - points.mean(dim=0)
@@ -118,7 +105,7 @@ class RigidPatch:
         vector = rotation if dim == 3 else [0.0, 0.0, *rotation]
         quaternion = torch.from_numpy(Rotation.from_rotvec(vector).as_quat())
         axis, cosine = quaternion[None, :3], quaternion[3]
-        arms = torch.nn.functional.pad(arms, (0, 3 - dim))
+        arms = pad(arms, (0, 3 - dim))
         # (R - I) r without the rounding of R, which exceeds a small rotation
         across = torch.linalg.cross(axis, arms)
         turned = 2 * (cosine * across + torch.linalg.cross(axis, across))
@@ -134,21 +121,29 @@ class RigidPatch:
         """Return the values, (m,), of a nodal field (N, D) at held degrees of freedom."""
         return field.reshape(-1)[self._dofs]
 
+    @cached_property
+    def _dofs(self) -> Tensor:
+        """Numbers of the held degrees of freedom, (m,); a mask takes longer."""
+        return self.held.flatten().nonzero()[:, 0]
+
+    @cached_property
+    def places(self) -> NDArray[np.int64]:
+        """Numbers of the held ones among the free degrees of freedom, (m,)."""
+        return np.flatnonzero(self.held[self.problem.free].numpy())
+
     @property
     def missing_rows(self) -> int:
         """Number of rows of the compliance that are not computed."""
-        return len(self._dofs) - sum(map(len, self._rows))
+        return len(self.places) - sum(map(len, self._rows))
 
     def prepare(self, *, one: bool = False) -> None:
         """Compute the rows of the compliance that are left, or the next one."""
-        dofs, free = self._dofs[len(self._dofs) - self.missing_rows :], self.problem.free
-        dofs = dofs[:1] if one else dofs
-        units = torch.zeros(len(dofs), self.held.numel(), dtype=torch.float64)
-        units[torch.arange(len(dofs)), dofs] = 1.0
-        right = units.view(-1, *self.held.shape)[:, free].numpy()
+        places = self.places[len(self.places) - self.missing_rows :][: 1 if one else None]
+        right = np.zeros((len(places), self.problem.pattern.size))
+        right[np.arange(len(places)), places] = 1.0
         factor = self.linear.float32_factor  # a block of one row takes longer than one solve
         rows = factor.solve(right[0], RTOL)[None] if one else factor.solve_many(right, RTOL)
-        self._rows.append(torch.from_numpy(rows)[:, self.held[free]])
+        self._rows.append(torch.from_numpy(rows[:, self.places]))
 
     @cached_property
     def _rows(self) -> list[Tensor]:
@@ -170,15 +165,12 @@ class RigidPatch:
     def newton(self, corrector: Newton, displacement: Tensor) -> Newton:
         """Return Newton's method for the body with the patch displaced by (m,) [-].
 
-        The preconditioner of the held body is computed once.
-
-        Args:
-            corrector: Newton's method of the body, whose options are used.
-            displacement: Displacement of the held degrees of freedom.
+        The options are those of the corrector, Newton's method of the body. The preconditioner of
+        the held body is computed once.
         """
         held = self._held_linear
         body = replace(held.problem, prescribed=self.problem.prescribed + self.at(displacement))
-        linear = replace(held, problem=body, parent=held)  # shares the factor of K(0)
+        linear = replace(held, problem=body, parent=held)  # shares the preconditioner
         return replace(corrector, problem=body, linear_solver=linear)
 
     @cached_property
@@ -187,46 +179,39 @@ class RigidPatch:
         parts = {each.name: getattr(self.problem, each.name) for each in fields(Problem)}
         parts |= {"free": self.problem.free & ~self.held, "discretisation": None}
         body = _HeldProblem(**parts, whole=self.problem)
-        return _HeldSolver(body, self.linear.tol, self.linear.linear, patch=self)
+        iterates = self.linear.float32_factor.negative_pivots is None
+        factor = None if iterates else _HeldFactor(self)
+        return LinearSolver(body, self.linear.tol, self.linear.linear, approximate=factor)
 
     def moved(self, displacement: Tensor, goal: Tensor) -> Tensor:
-        """Return a displacement whose patch is at a goal, from one near it, (N, D) [-].
+        """Return a displacement (N, D) whose patch is at a goal (m,), from one near it [-].
 
         The difference is a linear displacement in the rotated frames of the nodes.
-
-        Args:
-            displacement: Displacement of the body, (N, D) [-].
-            goal: Displacement of the held degrees of freedom, (m,) [-].
         """
         problem, dim = self.problem, displacement.shape[1]
         frames = self.linear.corotational.at(displacement[None]).rotations
         turns = torch.from_numpy(frames)[:, :dim, :dim]
-        gap = _products(turns.mT, self.at(goal - self.of_field(displacement)))
+        missing = self.at(goal - self.of_field(displacement))
+        gap = (turns.mT @ missing[..., None])[..., 0]
         force = problem.restrict(self.at(self.stiffness_times(self.of_field(gap))))
         added = problem.extend(self.linear.float32_factor.solve(force))
-        return displacement + _products(turns, added)
+        return displacement + (turns @ added[..., None])[..., 0]
 
     def wrench(self, force: Tensor, displacement: Tensor) -> Wrench:
         """Return the resultant of nodal forces (N, D) [-] on the patch at a displacement (N, D)."""
         forces = force[self.nodes]
         place = (self.problem.points + displacement)[self.nodes]
-        arms = place - place.mean(dim=0)
-        if arms.shape[1] == 3:
-            moment = torch.linalg.cross(arms, forces).sum(dim=0)
-        else:
-            moment = (arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0]).sum()[None]
-        return Wrench(forces.sum(dim=0), moment)
+        missing = 3 - place.shape[1]
+        arms, pulls = pad(place - place.mean(dim=0), (0, missing)), pad(forces, (0, missing))
+        moment = torch.linalg.cross(arms, pulls).sum(dim=0)
+        return Wrench(forces.sum(dim=0), moment[2:] if missing else moment)
 
 
 @dataclass(frozen=True, eq=False)
 class _HeldProblem(Problem):
-    """A body with a held patch; its own pattern and loops are made when a tangent is needed.
+    """A body with a held patch; its own pattern and loops are made when a tangent is needed."""
 
-    Attributes:
-        whole: The body without the gripper, whose internal forces are the same.
-    """
-
-    whole: Problem = field(kw_only=True, repr=False)
+    whole: Problem = field(kw_only=True, repr=False)  # without the gripper: the same inner forces
 
     def evaluate(self, displacement: Tensor) -> Evaluation:
         """Return internal force and min det F, without derivatives."""
@@ -238,70 +223,28 @@ class _HeldFactor(Factor):
     """K(0)^-1 of a body with a held patch, from the factor of the body without the gripper.
 
     A first solve moves the patch; the second one has the forces that bring it back to its place.
-
-    Attributes:
-        patch: The patch.
-        negative_pivots: 0.
     """
 
-    patch: RigidPatch
+    patch: RigidPatch  # the patch
     negative_pivots: int = 0
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right, in the accuracy of float32."""
         patch, factor = self.patch, self.patch.linear.float32_factor
-        force = np.zeros(len(self._held))
-        force[~self._held] = right
-        moved = torch.from_numpy(factor.solve(force)[self._held])
-        force[self._held] = -patch.stiffness_times(moved).numpy()
-        return factor.solve(force)[~self._held]
-
-    @cached_property
-    def _held(self) -> NDArray[np.bool_]:
-        """Mask of the held ones among the free degrees of freedom without the gripper."""
-        return self.patch.held[self.patch.problem.free].numpy()
-
-
-@dataclass(frozen=True, eq=False)
-class _HeldSolver(LinearSolver):
-    """Linear solver of a body with a held patch; one preconditioner for all its displacements.
-
-    Attributes:
-        patch: The patch.
-    """
-
-    patch: RigidPatch = field(kw_only=True, repr=False)
-
-    @cached_property
-    def float32_factor(self) -> Factor:
-        """Factor of K(0) in float32, that of the body without the gripper unless it iterates."""
-        whole = self.patch.linear.float32_factor
-        iterates = whole.negative_pivots is None
-        return super().float32_factor if iterates else _HeldFactor(self.patch)
-
-    @cached_property
-    def corotational(self) -> CorotationalPreconditioner:
-        """Preconditioner from `float32_factor`."""
-        return self.parent.corotational if self.parent else super().corotational
-
-
-def _products(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """Return the products of matrices (N, D, D) and vectors (N, D)."""
-    return (matrices @ vectors[:, :, None])[:, :, 0]
+        held = np.zeros(len(right) + len(patch.places), dtype=bool)
+        held[patch.places] = True
+        force = np.zeros(len(held))
+        force[~held] = right
+        moved = torch.from_numpy(factor.solve(force)[held])
+        force[held] = -patch.stiffness_times(moved).numpy()
+        return factor.solve(force)[~held]
 
 
 def flat_part(problem: Problem, nodes: Tensor) -> tuple[Tensor, int]:
     """Return the largest part of a patch that faces one way along an axis, (N,), and the axis.
 
     It consists of the facets whose normals are within 15 degrees of the axis: the part of the
-    patch that a flat plate across the axis touches.
-
-    Args:
-        problem: The body.
-        nodes: Mask of the nodes of the patch, (N,).
-
-    Raises:
-        ValueError: No facet of the patch is across an axis.
+    patch, a mask of nodes (N,), that a flat plate across the axis touches.
     """
     basis, mesh = problem.basis, problem.mesh
     corners = nodes.numpy()[basis.nodal_dofs[0]]

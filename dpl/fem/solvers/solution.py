@@ -111,11 +111,7 @@ class Solution(NamedTuple):
 
 
 def check_force(problem: Problem, load: Load) -> None:
-    """Check shape and type of a load's force; forces that are not finite are allowed.
-
-    Raises:
-        ValueError: The force is not (B, N, D) with B of 1 or more, or not float64.
-    """
+    """Raise a ValueError unless a force is (B, N, D) in float64, B >= 1; it may be infinite."""
     shape, wanted = tuple(load.force.shape), tuple(problem.shape)
     if len(shape) != 3 or shape[1:] != wanted or not shape[0]:
         raise ValueError(f"force.shape = {shape} must be {('B', *wanted)}, B of 1 or more")
@@ -171,18 +167,13 @@ def evaluate_solution(
     from_guess: bool = False,
     evaluation: Evaluation | None = None,
 ) -> Solution:
-    """Evaluate residual and min det F at a displacement and return them as a solution.
+    """Return a displacement (B, N, D) [-] as a solution, with its residual and min det F.
 
     Args:
-        problem: The body.
-        displacement: Displacement over L, (B, N, D) [-].
-        load: The load.
+        problem, displacement, load: The body, its displacement over L and the load on it.
         tol: Relative residual below which it counts as converged [-], see `check_tol`.
         iterations, seconds, from_guess: Values of the attributes of `Solution`.
         evaluation: Internal force and min det F at the displacement, if known.
-
-    Raises:
-        ValueError: `tol` is out of range.
     """
     check_tol(tol)
     problem = problem.with_parameters(load.parameters)

@@ -70,7 +70,6 @@ class StiffnessTerms:
 
     @cached_property
     def _inverse(self) -> Tensor:
-        """Pseudoinverse of the vectors, (M, T)."""
         return torch.linalg.pinv(self.vectors)
 
     @cached_property
@@ -147,10 +146,7 @@ class StiffnessTerms:
             )
 
     def support_forces(self) -> Tensor:
-        """Return forces of moved supports and of follower loads at rest, (T + 1, N, D) [-].
-
-        They are K_k p of the prescribed displacement p, and C p plus the forces of follower loads.
-        """
+        """Return K_k p of moved supports p, and C p plus follower loads at rest, (T + 1, N, D)."""
         problem = self.problem
         rest, p = torch.zeros(1, *problem.shape, dtype=torch.float64), problem.prescribed[None]
         moved = problem.moved_supports
@@ -163,19 +159,16 @@ class StiffnessTerms:
     def condition_numbers(self, factors: Tensor, node: Tensor) -> Tensor:
         """Return bounds of the condition numbers of K(node)^-1 K(0), (S,), for every load.
 
-        An energy is a sum over points, so that the ratio of two energies of a displacement lies
-        between those of the moduli of the cells, strain by strain. Springs have the ratio 1. Of
-        bodies with many different cells, `MAX_CELLS` are taken. With mean dilatation the bound is
-        approximate for laws with fibres, whose strain has the volume change of the point and not of
-        the cell.
-
-        Args:
-            factors: Factors of K(0), (S, T).
-            node: Factors of the other matrix, (1, T).
+        The factors of K(0) are (S, T), those of the node (1, T). An energy is a sum over points, so
+        that the ratio of two energies of a displacement lies between those of the moduli of the
+        cells, strain by strain. Springs have the ratio 1. Of bodies with many different cells,
+        `MAX_CELLS` are taken. With mean dilatation the bound is approximate for laws with fibres,
+        whose strain has the volume change of the point and not of the cell.
         """
         moduli = self._some_cells
         of_node, others = (torch.einsum("st,teij->seij", a, moduli) for a in (node, factors))
-        ratios = _ratios(of_node, others).flatten(1)
+        inverse = torch.linalg.inv(torch.linalg.cholesky(of_node))
+        ratios = torch.linalg.eigvalsh(inverse @ others @ inverse.mT).flatten(1)
         low, high = ratios.amin(dim=1), ratios.amax(dim=1)
         if self.problem.springs is not None:
             low, high = low.clamp(max=1.0), high.clamp(min=1.0)
@@ -185,10 +178,12 @@ class StiffnessTerms:
     def _some_cells(self) -> Tensor:
         """Moduli of the terms in at most `MAX_CELLS` different cells, (T, C, 6, 6).
 
-        They are quadratic forms of strains.
+        They are quadratic forms of six strains.
         """
         rest = torch.zeros(1, len(self.problem.cells), 1, 3, 3, dtype=torch.float64)
-        every = torch.stack([_matrices(b.material.tangent(rest)[0, :, 0]) for b in self.bodies])
+        every = torch.stack([b.material.tangent(rest)[0, :, 0] for b in self.bodies])
+        i, j = torch.tensor([0, 1, 2, 0, 1, 0]), torch.tensor([0, 1, 2, 1, 2, 2])
+        every = every[:, :, i[:, None], j[:, None], i, j]
         moduli = every.transpose(0, 1).flatten(1)  # (E, T 36)
         digits = (moduli / moduli.abs().amax() * 1e9).round()
         _, numbers = digits.unique(dim=0, return_inverse=True)
@@ -204,18 +199,6 @@ class StiffnessTerms:
         """Factors at corners and random points of the parameters, (S, T)."""
         law = self.problem.material
         return self.factors(law.with_parameters(_samples(law)))
-
-
-def _ratios(A: Tensor, B: Tensor) -> Tensor:
-    """Return the eigenvalues of B relative to A, (..., 6), of matrices (..., 6, 6)."""
-    inverse = torch.linalg.inv(torch.linalg.cholesky(A))
-    return torch.linalg.eigvalsh(inverse @ B @ inverse.mT)
-
-
-def _matrices(moduli: Tensor) -> Tensor:
-    """Return moduli (E, 3, 3, 3, 3) as quadratic forms of six strains, (E, 6, 6)."""
-    i, j = torch.tensor([0, 1, 2, 0, 1, 0]), torch.tensor([0, 1, 2, 1, 2, 2])
-    return moduli[:, i[:, None], j[:, None], i, j]
 
 
 def _samples(law: Material) -> Tensor:
