@@ -242,7 +242,7 @@ def test_the_energy_loss_has_the_equilibrium_as_its_minimum(one):
 
 
 def test_data_network_and_simulator_take_the_value(name, scene, tmp_path):
-    data = DataModule(scene, folder=str(tmp_path / "set"), train=16, val=4, test=4, workers=0)
+    data = DataModule(scene, folder=str(tmp_path / "set"), train=4, val=2, test=2, workers=0)
     data.prepare_data()
     assert [flaw for _, flaw in verify(Store(tmp_path / "set", scene, 0)) if flaw] == []
     test = data.samples("test")

@@ -15,15 +15,8 @@ from torch import Tensor
 def identity_of(value: object, *, exclude: Collection[str] = ()) -> dict[str, Any]:
     """Return the class name and the options of an object as plain data.
 
-    The options are the fields of a dataclass, or the attributes of any other object. A field with
-    the metadata `optional` is left out where it has its default.
-
-    Args:
-        value: The object.
-        exclude: Names of options to leave out.
-
-    Raises:
-        TypeError: An option has no form as plain data.
+    The options are the fields of a dataclass, or the attributes of any other object, without those
+    to `exclude`. A field with the metadata `optional` is left out where it has its default.
     """
     names = list(vars(value))
     if is_dataclass(value):

@@ -18,15 +18,12 @@ class Bounds(NamedTuple):
     below: float
     nonzero: bool
 
-    def contain(self, value: float) -> bool:
-        """Return True for a finite number within the bounds."""
-        return self.least <= value <= self.most and self.above < value < self.below
-
     def condition(self, value: float | Sequence[float]) -> str | None:
         """Return the condition that a number or a range [low, high] does not meet, in words."""
         is_range = isinstance(value, Sequence)
         ends = [*value] if isinstance(value, Sequence) else [value, value]
-        if len(ends) != 2 or not ends[0] <= ends[1] or not all(map(self.contain, ends)):
+        inside = (self.least <= x <= self.most and self.above < x < self.below for x in ends)
+        if len(ends) != 2 or not ends[0] <= ends[1] or not all(inside):
             if self.above > -math.inf and self.below < math.inf:
                 return f"lie between {self.above:g} and {self.below:g} (both excluded)"
             words = "a smallest and a largest number" if is_range else "a number"
@@ -56,8 +53,7 @@ def option(
         unit: SI unit, "times L" for multiples of the longest side, or "" for a pure number and for
             moduli in any unit.
         default: Value of the option if it is left out; an option without one must be given.
-        least: Least valid number.
-        most: Largest valid number.
+        least, most: Smallest and largest valid number.
         above, below: Numbers between which valid numbers lie.
         nonzero: Refuse the range [0, 0].
         optional: Leave the option out of identities where it has its default.
@@ -67,11 +63,7 @@ def option(
 
 
 def check_options(owner: Any) -> None:
-    """Check the options of a dataclass that are declared by `option`.
-
-    Raises:
-        ValueError: A value is out of bounds. The message names option, value, condition and unit.
-    """
+    """Check the options of a dataclass that are declared by `option`."""
     for one, bounds in declared(owner):
         value = getattr(owner, one.name)
         if value is not None and (condition := bounds.condition(value)):

@@ -77,37 +77,27 @@ class SignedOrbits(NamedTuple):
     def of_tensors(cls, parities: Parities, positions: Tensor, count: int, width: int) -> Self:
         """Return the orbits of `count` tensors (D, D) at each of C cells, in SIMD order.
 
-        The values of an orbit are ordered by block of `width` cells, tensor and entry of a 3 x 3
-        matrix, lane. Cells that fill a block and entries outside the plane have weight 0.
-
-        Args:
-            parities: The symmetries.
-            positions: Position to which each of them maps each cell, (M, C).
-            count: Number of tensors.
-            width: Cells of a block.
+        `positions` (M, C) are those to which the symmetries map the cells. The values of an orbit
+        are ordered by block of `width` cells, tensor and entry of a 3 x 3 matrix, lane. Cells that
+        fill a block and entries outside the plane have weight 0.
         """
         dim = parities.signs.shape[1]
         cells = (positions.amin(dim=0) == torch.arange(positions.shape[1])).nonzero()[:, 0]
-        blocks = -(-len(cells) // width)
-        shape = blocks, width, count, 3, 3
-        lanes = torch.zeros(shape, dtype=torch.bool).flatten(0, 1)
-        lanes[: len(cells), :, :dim, :dim] = True
-        index = torch.zeros(len(parities.members), *lanes.shape, dtype=torch.int64)
         entry = torch.arange(count * dim * dim).view(count, dim, dim)
-        image = positions[:, cells, None, None, None] * entry.numel() + entry
-        index[:, : len(cells), :, :dim, :dim] = image
-        weight = torch.zeros(lanes.shape, dtype=torch.float64)
-        stabiliser = (positions[:, cells] == cells).sum(dim=0)
-        weight[: len(cells), :, :dim, :dim] = (1 / stabiliser.double())[:, None, None, None]
-        sign = torch.zeros(index.shape, dtype=torch.float64)
+        index = positions[:, cells, None, None, None] * entry.numel() + entry
         outer = parities.signs[:, :, None] * parities.signs[:, None]
-        sign[:, : len(cells), :, :dim, :dim] = outer[:, None, None]
+        weight = 1 / (positions[:, cells] == cells).sum(dim=0).double()
 
         def in_blocks(values: Tensor) -> Tensor:
-            split = values.unflatten(-4, (blocks, width))
-            return split.movedim(-4, -1).flatten(-5)
+            missing = 0, 3 - dim, 0, 3 - dim, 0, 0, 0, -len(cells) % width
+            blocks = torch.nn.functional.pad(values, missing).unflatten(-4, (-1, width))
+            return blocks.movedim(-4, -1).flatten(-5)
 
-        return cls(in_blocks(index), in_blocks(sign), in_blocks(weight))
+        return cls(
+            in_blocks(index),
+            in_blocks(outer[:, None, None].expand_as(index)),
+            in_blocks(weight[:, None, None, None].expand(-1, count, dim, dim)),
+        )
 
     def by_parity(self, force: Tensor, parities: Parities) -> Tensor:
         """Return the products (M, m) of a force (n,) with the field of each orbit and parity."""
@@ -116,12 +106,8 @@ class SignedOrbits(NamedTuple):
     def coordinates(self, values: Tensor, characters: Tensor) -> Tensor:
         """Return coordinates (..., m) of the parts of fields (..., n) of one parity.
 
-        The basis is orthonormal. It has one field for each orbit, which is zero, as is its
-        coordinate, where the parity allows no other value.
-
-        Args:
-            values: The fields.
-            characters: Factor of the parity under each symmetry, (M,).
+        The parity has the factors `characters` (M,). The basis is orthonormal. It has one field for
+        each orbit, which is zero, as is its coordinate, where the parity allows no other value.
         """
         return self._products(values, characters) * self._scale(characters).to(values)
 
@@ -134,12 +120,9 @@ class SignedOrbits(NamedTuple):
         return result
 
     def symmetrised(self, matrix: Tensor, parity: Tensor, parities: Parities) -> Tensor:
-        """Return a matrix (n, R) whose columns have exactly their parities.
+        """Return a matrix (n, R) whose columns have exactly their parities (R,).
 
-        Args:
-            matrix: Columns that have their parities up to rounding.
-            parity: Parity of each column, (R,).
-            parities: The symmetries.
+        Those of the given matrix have them up to rounding.
         """
         result = torch.zeros_like(matrix)
         for p, characters in enumerate(parities.characters):

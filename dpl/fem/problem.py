@@ -13,20 +13,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.assembly.boundary_conditions import FoundationMatrix, Support, assemble_constraints
-from dpl.fem.assembly.discretisation import Discretisation, geometry
-from dpl.fem.assembly.elements import (
-    QUADRATIC,
-    QUADRATICALLY,
-    basis_of,
-    is_simplex,
-    locking_warnings,
+from dpl.fem.assembly.boundary_conditions import (
+    FoundationMatrix,
+    Support,
+    assemble_constraints,
+    rigid_body_modes,
+    unconstrained_modes,
 )
+from dpl.fem.assembly.discretisation import Discretisation, geometry
+from dpl.fem.assembly.elements import QUADRATIC, basis_of, locking_warnings
 from dpl.fem.assembly.equilibrium import relative_norm
 from dpl.fem.assembly.follower_loads import NO_LOADS, FollowerLoad, FollowerLoads
 from dpl.fem.assembly.kernels import CompiledLoops
 from dpl.fem.assembly.recovery import Recovery
-from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_modes
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.assembly.tensor_assembly import TensorAssembly
 from dpl.fem.materials.heterogeneous import Heterogeneous
@@ -34,19 +33,14 @@ from dpl.fem.materials.material import Material
 from dpl.fem.mesh.generators import longest_side, near_origin
 from dpl.fem.mesh.regions import Region
 from dpl.fem.ranges import ParameterRange
-from dpl.fem.units import Units, check_young
+from dpl.fem.units import Units
 
 MIN_MIXED_VOLUME = 1e-3  # volume ratio of mixed integration points below which they are not used
 MAX_BODIES = 64  # bodies of other parameters that are kept
 
 
 class Evaluation(NamedTuple):
-    """What a displacement is judged by.
-
-    Attributes:
-        internal: f_int, (B, N, D) [-].
-        volume_ratio: min det F over the quadrature points, (B,) [-].
-    """
+    """Internal force (B, N, D) [-], and min det F over the quadrature points (B,) [-]."""
 
     internal: Tensor
     volume_ratio: Tensor
@@ -149,6 +143,7 @@ class Problem:
 
         Geometry is evaluated from an origin near the body, so that a body far from zero loses no
         more digits than its coordinates lack. Regions and fields use the coordinates of `mesh`.
+        A warning names elements that will lock.
 
         Args:
             mesh: scikit-fem mesh [m]. A quadratic mesh overrides `degree`.
@@ -172,26 +167,19 @@ class Problem:
                 several moduli.
 
         Raises:
-            ValueError: `degree` is neither 1 nor 2, the cell type is unknown, a region is empty, a
-                boundary value is invalid, or `mean_dilatation` has no effect on the cells.
-
-        Warns:
-            UserWarning: The elements will lock, see `locking_warnings`.
+            ValueError: A condition on the mesh, the law or a boundary value is not met.
         """
         if degree not in (1, 2):
             raise ValueError(f"degree = {degree} must be 1 or 2")
-        check_young(young)
+        if young is not None and not 0 < young < math.inf:
+            raise ValueError(f"young = {young} must be a number above 0 [Pa]")
         degree = 2 if mesh.elem in QUADRATIC else degree
         length = longest_side(mesh.p.T) if length is None else length
         mesh, origin = near_origin(mesh)
         mesh, origin = mesh.scaled(1.0 / length), origin / length
         basis = basis_of(mesh, degree)
-        if mean_dilatation and degree == 1 and is_simplex(mesh):
-            raise ValueError(
-                "mean_dilatation = true must be used with hexahedra, quadrilaterals or quadratic "
-                f"elements; {QUADRATICALLY}, or mesh the body with hexahedra"
-            )
         units = Units(length, young)
+        parts = geometry(basis, degree, mean_dilatation=mean_dilatation)
         given, springs = assemble_constraints(
             basis, units, supports, origin=origin, fixed=fixed, prescribed=prescribed
         )
@@ -206,7 +194,7 @@ class Problem:
         for line in locking_warnings(mesh, degree, nu, mean_dilatation=mean_dilatation):
             warnings.warn(line, stacklevel=2)
         return cls(
-            **geometry(basis, degree, mean_dilatation=mean_dilatation),
+            **parts,
             material=material,
             length=length,
             origin=origin,
@@ -259,8 +247,7 @@ class Problem:
 
         The strain at a mixed point advances linearly with length * update, and by the same part of
         the gap before the step. The gap is the difference to the strain of u. With mean dilatation
-        the same holds for the volume changes of the cells, and the gap has two parts, see
-        `MixedGap`.
+        the same holds for the volume changes of the cells.
 
         Args:
             gap: Before the step; None: none.
@@ -293,16 +280,18 @@ class Problem:
         """Tensor operations of the cells alone, without foundation and follower loads."""
         return TensorAssembly(self.discretisation, self.material)
 
+    @cached_property
+    def _boundary_terms(self) -> list[FoundationMatrix | FollowerLoads]:
+        """Parts of the energy beside that of the cells."""
+        return [term for term in (self.springs, self.follower_loads) if term]
+
     def energy(self, displacement: Tensor) -> Tensor:
         """Return the energy over E L^D, (B,) [-]: strain energy, foundation and follower loads.
 
         The energy of a follower load is its potential only if it has one, see `has_potential`.
         """
-        energy = self.tensors.energy(displacement)
-        if self.springs is not None:
-            pull = self.springs.force(displacement)
-            energy = energy + (pull * displacement).sum((-2, -1)) / 2
-        return energy + self.follower_loads.work(displacement) if self.follower_loads else energy
+        works = (term.work(displacement) for term in self._boundary_terms)
+        return sum(works, self.tensors.energy(displacement))
 
     def internal_force(self, displacement: Tensor) -> Tensor:
         """Return f_int, the gradient of the energy, (B, N, D) [-]; reactions at fixed nodes.
@@ -332,17 +321,13 @@ class Problem:
 
     def _with_boundary_forces(self, internal: Tensor, displacement: Tensor) -> Tensor:
         """Return internal forces (B, N, D) plus those of foundation and follower loads."""
-        if self.springs is not None:
-            internal = internal + self.springs.force(displacement)
-        if self.follower_loads:
-            internal = internal + self.follower_loads.force(displacement)
-        return internal
+        return sum((term.force(displacement) for term in self._boundary_terms), internal)
 
     def _with_boundary_entries(
         self, tangent: Tensor, displacement: Tensor
     ) -> tuple[Tensor, Tensor | None]:
         """Return entries (B, nnz) with foundation and follower loads, and the skew part."""
-        if self.springs is not None:
+        if self._foundation_entries is not None:
             tangent = tangent + self._foundation_entries
         if not self.follower_loads:
             return tangent, None
@@ -350,12 +335,8 @@ class Problem:
         return tangent + added, skew
 
     @cached_property
-    def _foundation_entries(self) -> Tensor:
-        """Entries of the stiffness of the elastic foundation on the pattern, (nnz,) [-]."""
-        rows, columns, stiffness = (part.cpu().numpy() for part in self.springs or ())
-        places = self.pattern.between(rows, columns)
-        added = np.bincount(places.ravel(), stiffness.ravel(), len(self.pattern.indices) + 1)
-        return torch.from_numpy(added[:-1]).to(self.points.device)
+    def _foundation_entries(self) -> Tensor | None:
+        return None if self.springs is None else self.springs.entries(self.pattern)
 
     # ------------------------------------------------------------------ residual
 
@@ -370,23 +351,9 @@ class Problem:
     def relative_residual_of(self, internal: Tensor, force: Tensor) -> Tensor:
         """Return ||R_free|| / ||f||, (B,) [-], the criterion of equilibrium of all solvers.
 
-        ||f|| is the norm of the forces on free degrees of freedom. Forces on fixed ones do no
-        work and change no displacement, so they do not count. Where supports are moved, reactions
-        do work: ||f|| is then at least the norm of the reactions on the degrees of freedom whose
-        prescribed displacement is not 0. Reactions of supports that are not moved never count.
-        Under follower loads ||f|| is at least the norm of their nodal forces on the body at rest,
-        a measure that does not change with the displacement.
-
-        Without forces the result is ||R_free|| itself. It is NaN for a force that is not finite,
-        also on fixed degrees of freedom, and for one too small to compute with, see
-        `relative_norm`.
-
-        Source: OptiStruct 2020, Nonlinear Convergence Criteria (its relative error in loads counts
-        "nodal reactions due to specified displacements").
-
-        Args:
-            internal: f_int, (B, N, D) [-].
-            force: f, (B, N, D) [-].
+        The internal force f_int and f are (B, N, D) [-]. See `dpl.fem.assembly.equilibrium` for
+        ||f||. The result is ||R_free|| itself without forces, and NaN for a force that is not
+        finite, also on fixed degrees of freedom, or too small to compute with.
         """
         return self._measured(internal, force)[0]
 
@@ -395,19 +362,17 @@ class Problem:
     ) -> Tensor:
         """Return True where the relative residual is below tol or the roundoff bound, (B,)."""
         ratio, scale = self._measured(internal, force)
-        return (ratio < tol) | (
-            (ratio < 1e-4) & (ratio * scale <= self.roundoff_bound(displacement))
-        )
+        is_rounding = (ratio < 1e-4) & (ratio * scale <= self.roundoff_bound(displacement))
+        return (ratio < tol) | is_rounding
 
     def _measured(self, internal: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return `relative_residual_of` and the ||f|| that it is relative to, (B,) [-]."""
-        loads = [self.acting(force).flatten(1)]
+        loads = [self.acting(force)]
         if self.moved_supports:
-            loads.append((internal * (self.prescribed != 0)).flatten(1))
+            loads.append(internal * (self.prescribed != 0))
         if self.follower_loads:
-            at_rest = self.force_at_rest.reshape(-1, *self.shape)
-            loads.append(self.acting(at_rest).flatten(1))
-        return relative_norm(self.acting(internal - force).flatten(1), loads)
+            loads.append(self.acting(self.force_at_rest.reshape(-1, *self.shape)))
+        return relative_norm(self.acting(internal - force), loads)
 
     def acting(self, force: Tensor) -> Tensor:
         """Return a force (B, N, D) [-] at free degrees of freedom, where it has an effect.
@@ -438,7 +403,7 @@ class Problem:
         rest, and all their values share one factor.
         """
         rest = torch.zeros(1, *self.shape, dtype=torch.float64)
-        return replace(self, follower_loads=NO_LOADS).linearise(rest).tangent[0]
+        return self.under(0.0).linearise(rest).tangent[0]
 
     @cached_property
     def force_at_rest(self) -> Tensor:
@@ -456,8 +421,7 @@ class Problem:
         if not self.moved_supports:
             return self.force_at_rest
         rest, moved = self.prescribed.new_zeros(1, *self.shape), self.prescribed[None]
-        body = replace(self, follower_loads=NO_LOADS)
-        return body.tangent_product(rest, moved)[0] + self.force_at_rest
+        return self.under(0.0).tangent_product(rest, moved)[0] + self.force_at_rest
 
     @property
     def is_loaded_at_rest(self) -> bool:
@@ -481,6 +445,14 @@ class Problem:
         u = torch.where(self.free, 0.1 * noise.to(self.free.device), 0.7 * self.prescribed)
         return self.follower_loads.generic.stiffness(u, self.pattern)[1] is None
 
+    def under(self, factor: float) -> Self:
+        """Return the body under `factor` times its follower loads."""
+        if not self.follower_loads or factor == 1:
+            return self
+        loads = self.follower_loads
+        loads = FollowerLoads(loads.parts, factor * loads.values) if factor else NO_LOADS
+        return replace(self, follower_loads=loads)
+
     # ------------------------------------------------------------------ parameters
 
     @cached_property
@@ -496,39 +468,36 @@ class Problem:
         return parameters[:, : len(self.material.parameter_ranges)]
 
     def with_parameters(self, parameters: Tensor) -> Self:
-        """Return the problem with other parameters; mesh, pattern and kernels are shared.
+        """Return the problem with values (B, P) in place of `parameter_ranges`.
 
-        Args:
-            parameters: Values of `parameter_ranges`, (B, P). P = 0 returns the problem itself. With
-                B > 1 each member of a batch has its own: such a problem has energies, forces and
-                residuals, but no tangent. It is differentiable in parameters that require a
-                gradient.
+        P = 0 returns the problem itself. With B > 1 each member of a batch has its own values: such
+        a problem has energies, forces and residuals, but no tangent. It is differentiable in
+        parameters that require a gradient.
         """
-        ranges = self.parameter_ranges
-        if parameters.shape[-1] != len(ranges):
+        if parameters.shape[-1] != len(self.parameter_ranges):
             raise ValueError(
                 f"a load has {parameters.shape[-1]} parameters and the body has ranges of "
-                f"{list(ranges)}; give Load(force, young, parameters) one value for each"
+                f"{list(self.parameter_ranges)}; give Load(force, young, parameters) one value for "
+                "each"
             )
-        if not ranges:
+        if not self.parameter_ranges:
             return self
         parameters = parameters.to(self.points.device, torch.float64)
-        if len(parameters) > 1 or parameters.requires_grad:
-            return self._with_values(parameters)
-        values = tuple(parameters[0].tolist())
-        if values not in self._bodies:
+        is_new = len(parameters) > 1 or parameters.requires_grad
+        values = () if is_new else tuple(parameters[0].tolist())
+        if is_new or values not in self._bodies:
+            law, loads = self.material, self.follower_loads
+            if loads.ranges and self.young is not None:
+                stresses = parameters[:, len(law.parameter_ranges) :] / self.young
+                loads = loads.with_values(stresses)
+            law = law.with_parameters(self.law_parameters(parameters))
+            body = replace(self, material=law, follower_loads=loads)
+            if is_new:
+                return body
             if len(self._bodies) >= MAX_BODIES:
                 self._bodies.pop(next(iter(self._bodies)))
-            self._bodies[values] = self._with_values(parameters)
+            self._bodies[values] = body
         return self._bodies[values]
-
-    def _with_values(self, parameters: Tensor) -> Self:
-        """Return the problem with values (B, P) in place of all ranges."""
-        law, loads = self.material, self.follower_loads
-        if loads.ranges and self.young is not None:
-            loads = loads.with_values(parameters[:, len(law.parameter_ranges) :] / self.young)
-        law = law.with_parameters(self.law_parameters(parameters))
-        return replace(self, material=law, follower_loads=loads)
 
     @cached_property
     def _bodies(self) -> dict[tuple[float, ...], Self]:
@@ -543,12 +512,6 @@ class Problem:
         ranges = self.parameter_ranges.values()
         return self.with_parameters(torch.tensor([[ends.middle for ends in ranges]]).double())
 
-    def under(self, factor: float) -> Self:
-        """Return the body under `factor` times its follower loads."""
-        if not self.follower_loads or factor == 1:
-            return self
-        return replace(self, follower_loads=self.follower_loads.scaled(factor))
-
     # ------------------------------------------------------------------ units and parts
 
     @property
@@ -559,16 +522,13 @@ class Problem:
     @property
     def has_one_modulus(self) -> bool:
         """True if the body is divided by one modulus: elastic foundation or follower loads."""
-        return self.springs is not None or bool(self.follower_loads)
+        return bool(self._boundary_terms)
 
     def check_modulus(self, young: float) -> None:
         """Check the Young's modulus [Pa] of a load on this body.
 
         Elastic foundations have a fixed stiffness and follower loads a fixed stress, so that
         their parts in f_int are those of one modulus. Other bodies allow all moduli.
-
-        Raises:
-            ValueError: The modulus is not that of the foundation or the follower loads.
         """
         if not self.has_one_modulus or self.young is None or math.isclose(young, self.young):
             return

@@ -79,11 +79,9 @@ class ParameterRange(tuple[float, float]):
     def normalise(self, values: Tensor) -> Tensor:
         """Return values mapped from the range to [-1, 1], by their logarithm if that is uniform.
 
-        Without a range, the value is mapped to 0, and twice the value (or e times it, by the
-        logarithm) to 1.
+        Without width, the value is mapped to 0, and twice it (by the logarithm e times it) to 1.
         """
-        low, high = self
-        half = high
+        (low, high), half = self, self[1]
         if self.is_log:
             low, high, values, half = math.log(low), math.log(high), values.log(), 1.0
         return (2 * values - (low + high)) / ((high - low) or 2 * half)

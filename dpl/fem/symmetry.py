@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +12,6 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from dpl.fem.assembly.follower_loads import NO_LOADS
-from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
 
 Array = NDArray[np.float64]
@@ -50,13 +49,6 @@ class SymmetryGroup(tuple[Symmetry, ...]):
     """The symmetries of a body, the identity first."""
 
     __slots__ = ()
-
-    @classmethod
-    def identity(cls, problem: Problem) -> Self:
-        """Return the group of the identity alone."""
-        (nodes, dim), device = problem.shape, problem.points.device
-        rotation = torch.eye(dim, dtype=torch.float64, device=device)
-        return cls([Symmetry(rotation, torch.arange(nodes, device=device))])
 
     @property
     def rotations(self) -> Tensor:
@@ -130,31 +122,29 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> SymmetryGrou
 
     motions = _motions(points, np.count_nonzero(problem.free.cpu().numpy(), axis=1))
     moved = [Symmetry(*(part.to(fields.device) for part in pair)) for pair in motions]
-    found = list(filter(holds, moved)) or SymmetryGroup.identity(problem)
+    nodes, dim = problem.shape
+    identity = Symmetry(torch.eye(dim).to(fields), torch.arange(nodes, device=fields.device))
+    found = list(filter(holds, moved)) or [identity]
     return SymmetryGroup(sorted(_closed(found), key=lambda symmetry: symmetry.source.tolist()))
 
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
-    """Return the operators that commute with a symmetry: constraints, cells and loads."""
+    """Return the operators that commute with a symmetry: constraints, cells and loads.
+
+    The parameters of the law are no equal fractions of their ranges: laws of two regions that are
+    equal for these parameters are equal for all.
+    """
     loads = [problem.follower_loads.generic.force] if problem.follower_loads else []
     springs = [] if problem.springs is None else [problem.springs.force]
-    law = _generic(problem.material)
+    ranges = problem.material.parameter_ranges.values()
+    values = [ends.at((k + 1) / (len(ranges) + 1)) for k, ends in enumerate(ranges)]
+    law = problem.material.with_parameters(torch.tensor([values], dtype=torch.float64))
     cells = replace(problem, material=law, springs=None, follower_loads=NO_LOADS)
     operators: list[Callable[[Tensor], Tensor]] = [
         lambda field: torch.where(problem.free, field, 0.0),
         lambda field: cells.evaluate(field).internal,
     ]
     return [*operators, *springs, *loads]
-
-
-def _generic(law: Material) -> Material:
-    """Return a law with parameters of which no two are equal fractions of their ranges.
-
-    Laws of two regions are equal for these parameters only if they are for all.
-    """
-    ranges = list(law.parameter_ranges.values())
-    values = [ends.at((k + 1) / (len(ranges) + 1)) for k, ends in enumerate(ranges)]
-    return law.with_parameters(torch.tensor([values], dtype=torch.float64))
 
 
 def _fields(problem: Problem, points: Array) -> Tensor:

@@ -1,6 +1,5 @@
 """Conversion of boundary values in SI units to dimensionless quantities."""
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -29,26 +28,15 @@ class Units(NamedTuple):
         return value / self.length
 
     def stress(self, value: NDArray[np.float64], words: str) -> NDArray[np.float64]:
-        """Return stresses [Pa] over E [-].
-
-        Args:
-            value: Stresses, of any shape.
-            words: The option and its value, for the message of an error.
-        """
+        """Return stresses [Pa] over E [-]; `words` name the option in the message of an error."""
         return value / self._one_modulus(words)
 
     def stress_gradient(self, value: NDArray[np.float64], words: str) -> NDArray[np.float64]:
-        """Return forces per volume, or stiffnesses of a foundation, [N/m^3] times L / E [-].
-
-        Arguments and errors are those of `stress`.
-        """
+        """Return forces per volume, or stiffnesses of a foundation, [N/m^3] times L / E [-]."""
         return value * self.length / self._one_modulus(words)
 
     def force(self, value: NDArray[np.float64], dim: int, words: str) -> NDArray[np.float64]:
-        """Return nodal forces [N] (2D: [N/m]) over E L^(D - 1) [-].
-
-        Arguments and errors are those of `stress`; `dim` is D.
-        """
+        """Return nodal forces [N] (2D: [N/m]) over E L^(D - 1) [-], D = `dim`."""
         return value / (self._one_modulus(words) * self.length ** (dim - 1))
 
     def _one_modulus(self, words: str) -> float:
@@ -60,21 +48,8 @@ class Units(NamedTuple):
         return self.young
 
 
-def check_young(young: float | None) -> None:
-    """Check a modulus of `Units`."""
-    if young is not None and not 0 < young < math.inf:
-        raise ValueError(f"young = {young} must be a number above 0 [Pa]")
-
-
 def vector(name: str, value: Sequence[float], dim: int, unit: str) -> NDArray[np.float64]:
-    """Return the components of a boundary value, (D,).
-
-    Args:
-        name: Name of the option, for the message of an error.
-        value: The components.
-        dim: D.
-        unit: Unit of the components, for the message of an error.
-    """
+    """Return the components of a boundary value, (D,); name and unit are for messages."""
     if len(value) != dim or not np.isfinite(value).all():
         raise ValueError(
             f"{name} = {list(value)} must be {dim} finite numbers [{unit}]; "

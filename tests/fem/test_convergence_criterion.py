@@ -106,9 +106,8 @@ def test_huge_loads_are_never_answered(load, solvers, name, power):
     assert not (answer.residual < 0.5).any()
 
 
-@pytest.mark.parametrize("size", [1e-300, 5e-324])
-def test_loads_that_arithmetic_cannot_resolve_are_never_answered(load, solvers, size):
-    tiny = load._replace(force=size * (load.force / load.force.abs().max()))
+def test_loads_that_arithmetic_cannot_resolve_are_never_answered(load, solvers):
+    tiny = load._replace(force=1e-300 * (load.force / load.force.abs().max()))
     for name in ("newton", "linear", "direct"):
         assert not solvers[name](tiny).converged.any()
 
@@ -198,7 +197,7 @@ def test_the_size_of_a_load_in_a_data_set_is_that_on_free_nodes(make_scene):
 
 def test_forces_on_held_nodes_do_not_bend_a_column(make_scene):
     """The small force that lets a column give way is a part of the load that acts on it."""
-    scene = make_scene(size=(10.0, 1.0, 1.0), nodes=(11, 3, 3))
+    scene = make_scene(size=(10.0, 1.0, 1.0), nodes=(6, 3, 3))
     problem, newton = scene.problem, scene.solver
     force = torch.zeros(1, *problem.shape, dtype=torch.float64)
     end = problem.points[:, 0] == 1.0

@@ -306,7 +306,7 @@ PARTS = {
 
 def name_of(module: ModuleType) -> str:
     """Return the name of the type of a module's law, by which its machine code is found."""
-    return Law(module.Mine, 2, "code of the loops").kind.name
+    return Law.of(module.Mine(0.3).compiled_form, "code of the loops").kind.name
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -319,8 +319,8 @@ def test_type_of_a_law_changes_with_the_source_of_its_derivatives(written, part)
 
 
 def test_type_of_a_law_changes_with_the_code_of_the_loops():
-    first, other = (Law(fem.NeoHookeanLn, 2, code).kind.name for code in ("one", "another"))
-    assert first != other
+    form = fem.NeoHookeanLn(0.3).compiled_form
+    assert Law.of(form, "one").kind.name != Law.of(form, "another").kind.name
 
 
 @pytest.mark.parametrize("part", [None, "helper of a helper"])  # each is compiled
@@ -336,7 +336,7 @@ def _arithmetic(a, b, out):
     results = (
         *(x + y, x - y, x * y, x / y, -x, sqrt(y)),
         *(x + 2.0, 2.0 + x, x - 2.0, 2.0 - x, x * 3.0, 3.0 * x, x / 4.0, 4.0 / x),
-        *(x + 2, 2 + x, x - 2, 2 - x, x * 3, 3 * x, x / 4, 4 / x),
+        *(x + 2, 2 - x, x * 3, 4 / x),
     )
     row = 0
     for value in results:
@@ -350,12 +350,13 @@ def test_simd_vectors_add_multiply_and_divide_like_numbers():
     random = np.random.default_rng(0)
     a, b = random.uniform(0.5, 2.0, (2, 2, SIMD_WIDTH))
     a[:, ::2] *= -1
-    out = np.full((24, SIMD_WIDTH), np.nan)
+    out = np.full((20, SIMD_WIDTH), np.nan)
     _arithmetic(a, b, out)
     x, y = a[0], b[0]
     expected = [
         *(x + y, x - y, x * y, x / y, -x, np.sqrt(y)),
-        *(x + 2, 2 + x, x - 2, 2 - x, x * 3, 3 * x, x / 4, 4 / x) * 2,
+        *(x + 2, 2 + x, x - 2, 2 - x, x * 3, 3 * x, x / 4, 4 / x),
+        *(x + 2, 2 - x, x * 3, 4 / x),
         *(np.full(SIMD_WIDTH, 7.5), a[1]),
     ]
     assert out == pytest.approx(np.array(expected), rel=1e-15)

@@ -306,14 +306,6 @@ def test_constant_forces_reduce_the_group_to_their_symmetries(solver):
             assert_close(symmetry.image(force), force, rtol=0, atol=1e-13)
 
 
-def test_the_order_is_always_the_same():
-    problem = fem.Problem.build(ring(5), fem.LinearElastic(0.3))
-    first, again = fem.symmetries(problem), fem.symmetries(problem)
-    for one, other in zip(first, again, strict=True):
-        assert torch.equal(one.rotation, other.rotation)
-        assert torch.equal(one.source, other.source)
-
-
 def test_a_body_with_coincident_nodes_has_the_identity_only():
     """Two cubes that touch without nodes in common: which of the two is the image is not known."""
     shifted = CUBE.translated((1.0, 0.0, 0.0))

@@ -7,11 +7,11 @@ from typing import ClassVar
 import numpy as np
 import skfem
 import torch
-from scipy.sparse import csr_array
+from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly.elements import gradients
-from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Stress, entry_map
+from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Stress
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.fibres.reinforced import FibreDirections, fibre_frames
 from dpl.fem.materials.material import Material
@@ -47,17 +47,9 @@ class ActiveStress(FollowerLoad):
     name: str | None = None
 
     def on(
-        self,
-        basis: skfem.Basis,
-        units: Units,
-        material: Material,
-        origin: Origin = 0.0,
+        self, basis: skfem.Basis, units: Units, material: Material, origin: Origin = 0.0
     ) -> "ActiveFibres":
-        """Return the active fibres, see `FollowerLoad.on`.
-
-        Raises:
-            ValueError: The region contains no cell, or no fibre directions are known in one.
-        """
+        """Return the active fibres, see `FollowerLoad.on`."""
         cells = np.arange(basis.mesh.nelements)
         if self.region is not None:
             cells = cells_in(self.region, basis.mesh, units.length, origin)
@@ -68,10 +60,8 @@ class ActiveStress(FollowerLoad):
                 frames = self.directions.on(basis, units.length, origin)
             frames = frames if frames.ndim == 4 else frames[:, None]
             frames = frames.expand(basis.mesh.nelements, -1, -1, -1)
-        # column f; in 2D its part in plane
-        fibre = frames.expand(-1, basis.dx.shape[1], -1, -1).numpy()[
-            cells, :, : basis.mesh.dim(), 0
-        ]
+        dim = basis.mesh.dim()  # in 2D the fibre is its part in the plane
+        fibre = frames.expand(-1, basis.dx.shape[1], -1, -1).numpy()[cells, :, :dim, 0]
         if unknown := int(np.isnan(fibre).any(axis=(1, 2)).sum()):
             raise ValueError(
                 f"no fibre directions are known in {unknown} of {len(cells)} cells; set "
@@ -105,6 +95,7 @@ class ActiveFibres(LoadedPart):
 
     kind: ClassVar[str] = "active stress"
     key: ClassVar[str] = "active_stress"
+    extent: ClassVar[str] = "in {:,} cells"
     cells: Tensor
     fibre: Tensor
     slopes: Tensor
@@ -113,9 +104,6 @@ class ActiveFibres(LoadedPart):
     @property
     def directions(self) -> Tensor:
         return self.fibre
-
-    def describe(self) -> str:
-        return f"active stress in {len(self.cells):,} cells"
 
     def force(self, displacement: Tensor) -> Tensor:
         """Return the part of the internal force, (B, N, D) [-]."""
@@ -130,19 +118,18 @@ class ActiveFibres(LoadedPart):
         return (strain * self.volumes).sum((-2, -1))
 
     def stiffness(self, displacement: Tensor) -> list[Tensor]:
-        """Return entries of d force / du for pairs of nodes a <= b, b slowest, (B, M) [-]."""
-        return [self._stiffness.expand(len(displacement), -1)]
+        """Return entries of d force / du for pairs of nodes a <= b, b slowest, and components."""
+        entries = self._stiffness[:, None].expand(-1, displacement.shape[-1])
+        return [entries.flatten().expand(len(displacement), -1)]
 
     @cached_property
     def _stiffness(self) -> Tensor:
-        """`stiffness` for one displacement, (S A (A + 1)/2,) [-]."""
+        """Entries of one component, (S A (A + 1)/2,) [-]."""
         matrices = (self.slopes * self.volumes[..., None]).mT @ self.slopes
         b, a = np.tril_indices(self.nodes.shape[1])
         return matrices[:, a, b].flatten()
 
-    def maps(self, pattern: Pattern) -> list[csr_array]:
-        """Return the map of the entries, which are equal for all components."""
+    def places(self, pattern: Pattern) -> NDArray[np.int32]:
+        """Return the positions of the entries on a pattern, (S A (A + 1)/2 D,)."""
         own = pattern.places[self.cells.cpu().numpy()]  # (S, pairs, D, D)
-        target = own.diagonal(axis1=-2, axis2=-1).reshape(-1, own.shape[-1])
-        source = np.broadcast_to(np.arange(len(target))[:, None], target.shape)
-        return [entry_map(pattern, target, source, np.ones(target.shape))]
+        return own.diagonal(axis1=-2, axis2=-1).ravel()

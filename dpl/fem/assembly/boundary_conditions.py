@@ -1,4 +1,4 @@
-"""Boundary conditions: prescribed displacements and elastic foundations, each on a region."""
+"""Boundary conditions: prescribed displacements, elastic foundations, and what they constrain."""
 
 import math
 from collections.abc import Sequence
@@ -9,8 +9,10 @@ import numpy as np
 import skfem
 import torch
 from numpy.typing import NDArray
+from scipy.linalg import qr
 from torch import Tensor
 
+from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.mesh.regions import Origin, Region, facets_in, nodes_in
 from dpl.fem.units import Units
 
@@ -38,10 +40,7 @@ class DirichletBC:
     def on(self, basis: skfem.Basis, units: Units, origin: Origin = 0.0) -> NDArray[np.float64]:
         """Return g / L, (N, D) [-], NaN where a component is free.
 
-        Args:
-            basis: Scalar basis of a body, its coordinates divided by L.
-            units: L and E.
-            origin: Origin of these coordinates, (D,) [-].
+        The coordinates of the scalar basis are those from `origin` (D,), divided by L.
         """
         given = self.dimensionless(basis.mesh.dim(), units)
         where = nodes_in(self.region, basis, units.length, origin)
@@ -104,6 +103,17 @@ class FoundationMatrix(NamedTuple):
         pull = self.stiffness * displacement[:, self.columns]
         return torch.zeros_like(displacement).index_add(1, self.rows, pull)
 
+    def work(self, displacement: Tensor) -> Tensor:
+        """Return the energy, half of force times displacement, (B,) [-]."""
+        return (self.force(displacement) * displacement).sum((-2, -1)) / 2
+
+    def entries(self, pattern: Pattern) -> Tensor:
+        """Return the entries of the matrix on a pattern, (nnz,) [-]."""
+        rows, columns, stiffness = (part.cpu().numpy() for part in self)
+        places = pattern.positions(pattern.number[rows], pattern.number[columns])
+        added = np.bincount(places.ravel(), stiffness.ravel(), len(pattern.indices) + 1)
+        return torch.from_numpy(added[:-1]).to(self.stiffness.device)
+
 
 Support = DirichletBC | RobinBC
 
@@ -119,16 +129,9 @@ def assemble_constraints(
 ) -> tuple[NDArray[np.float64], FoundationMatrix | None]:
     """Return g / L, (N, D) [-], NaN where free, and the matrix of the foundations.
 
-    Args:
-        basis: Scalar basis of a body, its coordinates divided by L.
-        units: L and E.
-        supports: Boundary conditions.
-        origin: Origin of these coordinates, (D,) [-].
-        fixed: Further fixed nodes, as a region or as a mask (N,) or (N, D).
-        prescribed: Displacement of `fixed` over L, (N, D) [-]; default: zero.
-
-    Raises:
-        ValueError: A region is empty, or a boundary condition does not fit the body.
+    `fixed` are further fixed nodes, a region or a mask (N,) or (N, D), and `prescribed` is their
+    displacement over L, (N, D) [-], zero if left out. For `basis` and `origin` see
+    `DirichletBC.on`.
     """
     shape = basis.N, basis.mesh.dim()
     given = np.full(shape, np.nan)
@@ -148,3 +151,43 @@ def assemble_constraints(
     springs = [s.on(basis, units, origin) for s in supports if isinstance(s, RobinBC)]
     total = FoundationMatrix(*map(torch.cat, zip(*springs, strict=True))) if springs else None
     return given, total
+
+
+def rigid_body_modes(points: Tensor) -> tuple[Tensor, list[str]]:
+    """Return the rigid body modes of points (N, D), (N, D, 3 in 2D or 6), and their names."""
+    points = points - points.mean(dim=0)
+    dim = points.shape[1]
+    motions, names = [], []
+    for axis in range(dim):
+        motions.append(torch.eye(dim, dtype=points.dtype)[axis].expand_as(points))
+        names.append(f"translation along {'xyz'[axis]}")
+    for i, j in [(1, 2), (0, 2), (0, 1)] if dim == 3 else [(0, 1)]:
+        rotation = torch.zeros_like(points)
+        rotation[:, i], rotation[:, j] = -points[:, j], points[:, i]
+        motions.append(rotation)
+        names.append(f"rotation about {'xyz'[3 - i - j]}")
+    return torch.stack(motions, dim=-1), names
+
+
+def unconstrained_modes(
+    points: Tensor, free: Tensor, springs: FoundationMatrix | None
+) -> list[str]:
+    """Return the names of the rigid body modes that the boundary conditions do not constrain.
+
+    `points` are the nodes (N, D), `free` is the mask of the free degrees of freedom (N, D).
+    """
+    motions, names = rigid_body_modes(points)
+    fixed = motions[~free].numpy()  # (fixed degrees of freedom, motions)
+    gram = fixed.T @ fixed
+    if springs is not None:
+        pull = springs.force(motions.movedim(-1, 0)).flatten(1)
+        bed = (pull @ motions.flatten(0, 1)).numpy()
+        gram = gram + bed / max(float(springs.stiffness.max()), 1e-300)
+    if not gram.any():
+        return names
+    values, vectors = np.linalg.eigh(gram)
+    null = vectors[:, values < 1e-14 * max(1.0, values.max())]
+    if not null.size:
+        return []
+    _, pivots = qr(null.T, mode="r", pivoting=True)  # motions that span the null space
+    return [names[k] for k in np.sort(pivots[: null.shape[1]])]

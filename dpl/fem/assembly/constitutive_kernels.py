@@ -205,26 +205,12 @@ def add_pressure(p, modulus, J, X, finite, S, D, moduli):
 
 
 @inlined
-def volume_slope(F, X, J, finite, out):
-    """Set out to dJ/dF = J F X, for a law of small strains to I (rows 3 i + j)."""
-    for i in range(3):
-        for k in range(3):
-            total = load(F, 3 * i) * load(X, VOIGT[0, k])
-            total = total + load(F, 3 * i + 1) * load(X, VOIGT[1, k])
-            total = total + load(F, 3 * i + 2) * load(X, VOIGT[2, k])
-            store(out, 3 * i + k, total * J)
-
-
-@inlined
 def second_volume_change(H, step):
     """Return J(F) - J(F - A) - cof(F - A) : A of F = I + H and the step A."""
     double, third = 0.0 * load(H, 0), 0.0 * load(H, 0)
     for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
         for c in range(3):
-            d, e = (c + 1) % 3, (c + 2) % 3
-            minor = load(step, 3 * j + d) * load(step, 3 * k + e)
-            minor = minor - load(step, 3 * j + e) * load(step, 3 * k + d)
+            minor = cofactor(step, i, c)
             double = double + minor * (load(H, 3 * i + c) + (1.0 if i == c else 0.0))
             if i == 0:
                 third = third + minor * load(step, c)

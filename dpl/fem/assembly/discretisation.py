@@ -10,7 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.assembly.elements import basis_of, gradients, is_simplex, reference_gradients
+from dpl.fem.assembly.elements import (
+    QUADRATICALLY,
+    basis_of,
+    gradients,
+    is_simplex,
+    reference_gradients,
+)
 from dpl.fem.assembly.kernels import CompiledLoops, Kernels
 from dpl.fem.assembly.mean_dilatation import POINT_SHEAR, CellVolumes
 from dpl.fem.assembly.recovery import Recovery
@@ -23,6 +29,11 @@ def geometry(basis: skfem.Basis, degree: int, *, mean_dilatation: bool) -> dict[
     dN, dV = gradients(basis)
     functions = None
     if mean_dilatation:
+        if degree == 1 and is_simplex(basis.mesh):
+            raise ValueError(
+                "mean_dilatation = true must be used with hexahedra, quadrilaterals or quadratic "
+                f"elements; {QUADRATICALLY}, or mesh the body with hexahedra"
+            )
         at = np.asarray(basis.global_coordinates())[:, : len(dV)].transpose(1, 2, 0)
         points = torch.from_numpy(np.ascontiguousarray(at))
         linear = degree == 2 and not is_simplex(basis.mesh)
@@ -108,10 +119,9 @@ class Discretisation:
     def compiled(self, material: Material) -> CompiledLoops | None:
         """Return the compiled loops of a law, None where it has none."""
         groups = material.groups(len(self.cells))
-        compiled = [pair for pair in groups if pair[0].compiled_form is not None]
-        loops = [self._loop(cells, law) for law, cells in compiled]
-        if len(loops) < len(groups):
+        if any(law.compiled_form is None for law, _ in groups):
             return None
+        loops = [self._loop(cells, law) for law, cells in groups]
         return CompiledLoops(loops, len(self.pattern.indices))
 
     def _loop(self, chosen: Tensor, law: Material) -> Kernels:
@@ -125,18 +135,13 @@ class Discretisation:
             self._kernels[key] = Kernels(
                 law,
                 cells=self.cells.numpy()[numbers],
-                reference=self._reference,
+                reference=reference_gradients(self.mesh, self.degree),
                 dN=self.dN.numpy()[own],
                 dV=self.dV.numpy()[own],
                 places=self.pattern.places.reshape(len(self.cells), -1)[numbers],
                 volumes=volumes,
             )
         return self._kernels[key].with_law(law)
-
-    @cached_property
-    def _reference(self) -> NDArray[np.float64]:
-        """Gradients of the shape functions of the reference element, (Q, A, D)."""
-        return reference_gradients(self.mesh, self.degree)
 
     @cached_property
     def _kernels(self) -> dict[bytes, Kernels]:
@@ -158,7 +163,7 @@ class Discretisation:
 
     def nodal_forces(self, stress: Tensor) -> Tensor:
         """Return the nodal forces (B, N, D) of first Piola-Kirchhoff stresses (B, E, Q, 3, 3)."""
-        return self.sum_at_nodes(self._cell_forces(stress))
+        return self._sum_at_nodes(self._cell_forces(stress))
 
     def _cell_forces(self, stress: Tensor) -> Tensor:
         """Return the forces of each cell at its nodes (B, E, A, D) of stresses (B, E, Q, 3, 3)."""
@@ -167,7 +172,7 @@ class Discretisation:
         weighted = weighted.transpose(-3, -2).flatten(-2)  # (B, E, D, QD)
         return (weighted @ self._operator.mT).mT
 
-    def sum_at_nodes(self, per_cell: Tensor) -> Tensor:
+    def _sum_at_nodes(self, per_cell: Tensor) -> Tensor:
         """Return the sums at nodes (B, N, D) of values of each cell at its nodes (B, E, A, D)."""
         force = per_cell.new_zeros(len(per_cell), *self.shape)
         return force.index_add(1, self.cells.flatten(), per_cell.flatten(1, 2))
@@ -183,7 +188,7 @@ class Discretisation:
         modulus = material.lam + 2 * material.mu
         terms = (modulus.to(terms) * terms[None])[..., None]  # (B or 1, E, A, 1)
         terms = terms.expand(-1, len(self.cells), -1, self.shape[1])
-        summed = torch.where(self.free.any(dim=1), self.sum_at_nodes(terms)[..., 0], 0.0)
+        summed = torch.where(self.free.any(dim=1), self._sum_at_nodes(terms)[..., 0], 0.0)
         return torch.finfo(torch.float64).eps * summed.norm(dim=1)
 
     def entries(

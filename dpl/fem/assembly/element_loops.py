@@ -207,7 +207,8 @@ def add_system(
                     value = value_of(pressure, functions[q])
                     point.add_pressure(value, 0.0, J, X, finite, own_S, D, own_D)
                 if moduli:
-                    point.volume_slope(F, X, J, finite, T)
+                    for r in range(9):  # dJ/dF
+                        store(T, r, point.cofactor(F, r // 3, r % 3))
                     point.along(T, inverse, first, H, 0)
                     for m in range(M):
                         factor = weight * load(functions[q], m)

@@ -38,14 +38,8 @@ def basis_of(mesh: skfem.Mesh, degree: int) -> skfem.Basis:
     """Return scikit-fem's basis of one displacement component.
 
     The quadrature integrates the gradients of the shape functions exactly, also in curved cells.
-    Therefore every element passes the patch test.
-
-    Args:
-        mesh: The cells, near the origin, because scikit-fem evaluates absolute coordinates.
-        degree: Polynomial degree of the displacement, 1 or 2.
-
-    Raises:
-        ValueError: There is no element for the shape of the cells.
+    Therefore every element passes the patch test. The mesh must lie near the origin, because
+    scikit-fem evaluates absolute coordinates.
     """
     element, quadrature = _element_of(mesh, degree)
     return skfem.Basis(mesh, element, quadrature=quadrature)
@@ -69,7 +63,9 @@ def _element_of(mesh: skfem.Mesh, degree: int) -> tuple[skfem.Element, tuple[Arr
     if (shape, degree) == ("Triangular", 1):  # scikit-fem's smallest rule has three points
         return element(), (np.array([[1 / 3], [1 / 3]]), np.array([1 / 2]))
     if (shape, degree) == ("Tetrahedral", 2) and _curved(mesh):
-        return element(), _curved_rule()
+        # degree 3: in curved cells the gradient of a shape function times det J is cubic
+        points = np.hstack([np.where(np.eye(4)[:3], 1 - 3 * a, a) for a, _ in CURVED])
+        return element(), (points, np.repeat([share / 6 for _, share in CURVED], 4))
     return element(), get_quadrature(element.refdom, order)
 
 
@@ -80,15 +76,6 @@ def _curved(mesh: skfem.Mesh) -> bool:
     J = mesh.mapping().DF(mesh.elem.refdom.p)  # (D, D, E, corners)
     change = np.ptp(J, axis=-1).max(axis=(0, 1))
     return bool((change > STRAIGHT * np.abs(J).max(axis=(0, 1, 3))).any())
-
-
-def _curved_rule() -> tuple[Array, Array]:
-    """Return points (3, 8) and weights (8,) of degree 3 on the reference tetrahedron.
-
-    In curved cells the gradient of a shape function times det J is cubic.
-    """
-    points = [np.where(np.eye(4)[:3], 1 - 3 * a, a) for a, _ in CURVED]
-    return np.hstack(points), np.repeat([share / 6 for _, share in CURVED], 4)
 
 
 def gradients(basis: skfem.Basis) -> tuple[Array, Array]:
@@ -110,11 +97,7 @@ def locking_warnings(
 ) -> list[str]:
     """Return one line for each reason why the elements of a body will lock.
 
-    Args:
-        mesh: The cells.
-        degree: Polynomial degree of the displacement.
-        poisson: Largest Poisson's ratio [-].
-        mean_dilatation: Whether the volume ratio is projected in each cell.
+    `poisson` is its largest Poisson's ratio [-].
     """
     lines, shape = [], mesh.elem.refdom.name.lower()
     locking = f"{shape} elements lock at Poisson's ratio {poisson:.4g}"

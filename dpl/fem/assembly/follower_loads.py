@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import skfem
 import torch
-from scipy.sparse import csr_array
+from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly.sparsity import Pattern
@@ -30,9 +30,7 @@ class FollowerLoad:
     """Specification of a follower load: a stress on a part of a body.
 
     Attributes:
-        value: The stress [Pa]; or a range [low, high] or {low, high, distribution}, of which each
-            load has its own, see `Problem.parameter_ranges`. On a problem with E = 1 Pa, the
-            default of `Problem.build`, this is the stress over E.
+        value: The stress [Pa]; or a range [low, high] or {low, high, distribution}.
         name: Name of the parameter of a range; `default_name` if left out.
     """
 
@@ -61,19 +59,11 @@ class FollowerLoad:
         return (math.nan if ends else stress), ends
 
     def on(
-        self,
-        basis: skfem.Basis,
-        units: Units,
-        material: Material,
-        origin: Origin = 0.0,
+        self, basis: skfem.Basis, units: Units, material: Material, origin: Origin = 0.0
     ) -> "LoadedPart":
-        """Return the loaded facets or cells of a body.
+        """Return the loaded facets or cells of a body, whose law is that after `Material.on`.
 
-        Args:
-            basis: Scalar basis of the body, its coordinates divided by L.
-            units: L and E.
-            material: Law of the body, after `Material.on`.
-            origin: Origin of the coordinates, (D,) [-].
+        The coordinates of the scalar basis are those from `origin` (D,), divided by L.
         """
         raise NotImplementedError
 
@@ -88,6 +78,7 @@ class LoadedPart:
 
     kind: ClassVar[str]  # name in messages
     key: ClassVar[str]  # name in the identity of a scene
+    extent: ClassVar[str]  # of a number of facets or cells, in words
     nodes: Tensor
 
     def to(self, device: torch.device | str) -> Self:
@@ -121,24 +112,24 @@ class LoadedPart:
         """
         raise NotImplementedError
 
-    def maps(self, pattern: Pattern) -> list[csr_array]:
-        """Return the matrices (nnz, M) from entries of `stiffness` to entries of K."""
+    def places(self, pattern: Pattern) -> NDArray[Any]:
+        """Return the positions of the entries on a pattern, (M,); nnz for those not stored."""
         raise NotImplementedError
 
-    def maps_on(self, pattern: Pattern) -> list[csr_array]:
-        """Return `maps`, computed once for the last pattern."""
-        if pattern not in self._maps:
-            self._maps.clear()
-            self._maps[pattern] = self.maps(pattern)
-        return self._maps[pattern]
+    def places_on(self, pattern: Pattern) -> Tensor:
+        """Return `places`, computed once for the last pattern."""
+        if pattern not in self._places:
+            self._places.clear()
+            self._places[pattern] = torch.from_numpy(self.places(pattern).astype(np.int64))
+        return self._places[pattern]
 
     @cached_property
-    def _maps(self) -> dict[Pattern, list[csr_array]]:
+    def _places(self) -> dict[Pattern, Tensor]:
         return {}
 
     def describe(self) -> str:
         """Return the part in words."""
-        raise NotImplementedError
+        return f"{self.kind} {self.extent.format(len(self.nodes))}"
 
     def _sum_at_nodes(self, forces: Tensor, displacement: Tensor) -> Tensor:
         """Return the sums (B, N, D) of forces of facets or cells at their nodes (B, S, A, D)."""
@@ -228,10 +219,6 @@ class FollowerLoads:
         """Mask of the loads with a range, (P,)."""
         return self.values[0].isnan()
 
-    def scaled(self, factor: float) -> Self:
-        """Return the loads times a factor, without ranges."""
-        return type(self)(self.parts, factor * self.values)
-
     def with_values(self, values: Tensor) -> Self:
         """Return the loads with stresses over E in place of the ranges, (1, R) or (B, R) [-]."""
         every = self.values.expand(len(values), -1)
@@ -275,28 +262,17 @@ class FollowerLoads:
 
         The skew part is None where it is zero to rounding: then the matrix is symmetric.
         """
-        symmetric, skew = np.zeros((2, len(displacement), len(pattern.indices)))
-        largest = 0.0
-        for value, part in zip(self.values.detach().cpu().numpy().T, self.parts, strict=True):
-            parts = zip(
-                (symmetric, skew), part.stiffness(displacement), part.maps_on(pattern), strict=False
-            )
-            for total, entries, matrix in parts:
-                scaled = value[:, None] * entries.detach().cpu().numpy()
-                total += (matrix @ scaled.T).T
-                largest = max(largest, np.abs(scaled).max())
-        found = [torch.from_numpy(part).to(displacement.device) for part in (symmetric, skew)]
-        is_symmetric = np.abs(skew).max(initial=0.0) <= ASYMMETRIC * largest
-        return found[0], None if is_symmetric else found[1]
-
-
-def entry_map(pattern: Pattern, target: Any, source: Any, factor: Any) -> csr_array:
-    """Return the matrix (nnz, M) that adds `factor` times entry `source` to K at `target`.
-
-    Arguments are arrays of one shape. Targets that K does not store are omitted.
-    """
-    stored, shape = target < len(pattern.indices), (len(pattern.indices), source.max() + 1)
-    return csr_array((factor[stored], (target[stored], source[stored])), shape=shape)
+        count, largest = len(pattern.indices), 0.0
+        total = displacement.new_zeros(2, len(displacement), count + 1)
+        for value, part in zip(self.values.detach().unbind(1), self.parts, strict=True):
+            places = part.places_on(pattern).to(displacement.device)
+            for sums, entries in zip(total, part.stiffness(displacement), strict=False):
+                scaled = (value[:, None] * entries.detach()).expand(len(sums), -1)
+                sums.scatter_add_(1, places.expand(len(sums), -1), scaled)
+                largest = max(largest, float(scaled.abs().max()))
+        symmetric, skew = total[..., :count]
+        is_symmetric = bool((skew.abs() <= ASYMMETRIC * largest).all())
+        return symmetric, None if is_symmetric else skew
 
 
 NO_LOADS = FollowerLoads()

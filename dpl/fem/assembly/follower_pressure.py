@@ -8,11 +8,10 @@ import numpy as np
 import skfem
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.assembly.elements import QUADRATIC
-from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Stress, entry_map
+from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Stress
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin, Region, facets_in
@@ -43,16 +42,11 @@ class FollowerPressure(FollowerLoad):
     name: str | None = None
 
     def on(
-        self,
-        basis: skfem.Basis,
-        units: Units,
-        material: Material,
-        origin: Origin = 0.0,
+        self, basis: skfem.Basis, units: Units, material: Material, origin: Origin = 0.0
     ) -> "PressureSurface":
         """Return the loaded surface, see `FollowerLoad.on`."""
-        return PressureSurface.build(
-            basis, facets_in(self.region, basis.mesh, units.length, origin)
-        )
+        facets = facets_in(self.region, basis.mesh, units.length, origin)
+        return PressureSurface.build(basis, facets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +71,7 @@ class PressureSurface(LoadedPart):
 
     kind: ClassVar[str] = "follower pressure"
     key: ClassVar[str] = "pressure"
+    extent: ClassVar[str] = "on {:,} facets"
     weights: Tensor
     slopes: Tensor
     tangents: Tensor
@@ -105,12 +100,9 @@ class PressureSurface(LoadedPart):
             tangents=torch.from_numpy(tangents),
         )
 
-    def describe(self) -> str:
-        return f"follower pressure on {len(self.nodes):,} facets"
-
     def force(self, displacement: Tensor) -> Tensor:
         """Return dV/du, minus the nodal forces of the pressure, (B, N, D) [-]."""
-        first, second = self._images(self._slopes(displacement))
+        first, second = (self.tangents + self._slopes(displacement)).unbind(-1)
         return self._sum_of_normals(torch.linalg.cross(first, second), displacement)
 
     def work(self, displacement: Tensor) -> Tensor:
@@ -126,27 +118,19 @@ class PressureSurface(LoadedPart):
         return (self._sum_of_normals(normal, displacement) * displacement).sum((-2, -1))
 
     def stiffness(self, displacement: Tensor) -> list[Tensor]:
-        """Return entries of the load stiffness, (B, S A (A + 1)/2 3) [-] each.
+        """Return the entries of both parts for all pairs of a facet, (B, S (A D)^2) [-] each.
 
-        The block of the nodes a <= b (b slowest) is the cross product with one vector: its entries
-        (i, k) are epsilon_ikl times the component l. In the symmetric part, blocks of a node with
-        itself are zero. In the skew part the blocks of neighbouring facets cancel, so that only the
-        edge of the surface is left.
+        The block of the nodes a and b has the entries epsilon_ikl c_l. In the skew part the blocks
+        of neighbouring facets cancel, so that only the edge of the surface is left.
         """
-        b, a = np.tril_indices(self.nodes.shape[1])
-        vectors = self._pair_vectors(displacement)
-        here, there = vectors[:, :, a, b] / 2, vectors[:, :, b, a] / 2
-        return [(here - there).flatten(1), (here + there).flatten(1)]
-
-    def _pair_vectors(self, displacement: Tensor) -> Tensor:
-        """Return vectors c of all pairs of nodes, (B, S, A, A, 3) [-].
-
-        The load stiffness of the nodes a and b has the entries epsilon_ikl c_l.
-        """
-        y1, y2 = self._images(self._slopes(displacement))  # (B, S, Q, 3)
+        dim = displacement.shape[-1]
+        y1, y2 = (self.tangents + self._slopes(displacement)).unbind(-1)  # (B, S, Q, 3)
         first, second = self._pair_weights
-        vectors = first @ y2 - second @ y1
-        return vectors.unflatten(2, (self.nodes.shape[1], -1))
+        c = (first @ y2 - second @ y1).unflatten(2, (self.nodes.shape[1], -1))  # (B, S, A, A, 3)
+        unit = torch.eye(3).to(c).expand(*c.shape, 3)
+        crossed = torch.linalg.cross(c[..., None, :], unit)  # rows i, columns k
+        matrices = crossed[..., :dim, :dim].transpose(3, 4).flatten(4, 5).flatten(2, 3)
+        return [((matrices + sign * matrices.mT) / 2).flatten(1) for sign in (1.0, -1.0)]
 
     @cached_property
     def _pair_weights(self) -> tuple[Tensor, Tensor]:
@@ -155,22 +139,10 @@ class PressureSurface(LoadedPart):
         first, second = (weights * slopes[:, :, None]).flatten(2, 3)
         return first, second
 
-    def maps(self, pattern: Pattern) -> list[csr_array]:
-        """Return the maps of both parts; K stores the upper triangle."""
-        nodes = self.nodes.cpu().numpy()
-        b, a = np.tril_indices(nodes.shape[1])
-        missing = 3 - pattern.number.shape[1]
-        numbers = np.pad(pattern.number, ((0, 0), (0, missing)), constant_values=-1)
-        rows, columns = numbers[nodes[:, a]], numbers[nodes[:, b]]  # (S, pairs, 3)
-        i, k = np.array([1, 2, 0]), np.array([2, 0, 1])  # epsilon_ikl = 1 for l = 0, 1, 2
-        first = np.stack([rows[..., i], rows[..., k]])
-        second = np.stack([columns[..., k], columns[..., i]])
-        source = np.broadcast_to(np.arange(first[0].size).reshape(first[0].shape), first.shape)
-        target = pattern.positions(first, second)
-        sign = np.array([1.0, -1.0])[:, None, None, None] * np.ones(first.shape)
-        # the two halves of the block of a node with itself fall on the same entries
-        skew_sign = np.where(first < second, sign, -sign) * np.where(a == b, 0.5, 1.0)[:, None]
-        return [entry_map(pattern, target, source, factor) for factor in (sign, skew_sign)]
+    def places(self, pattern: Pattern) -> NDArray[np.int64]:
+        """Return the positions of the entries on a pattern, (S (A D)^2,)."""
+        numbers = pattern.number[self.nodes.cpu().numpy()].reshape(len(self.nodes), -1)
+        return pattern.positions(numbers[:, :, None], numbers[:, None, :]).ravel()
 
     def _slopes(self, displacement: Tensor) -> Tensor:
         """Return du/dxi_i at the quadrature points, (B, S, Q, 3, 2) [-]; in 2D with zeros."""
@@ -178,11 +150,6 @@ class PressureSurface(LoadedPart):
         at_facets = torch.nn.functional.pad(at_facets, (0, 3 - at_facets.shape[-1]))
         slopes = self.slopes.transpose(2, 3).flatten(1, 2) @ at_facets  # (B, S, 2 Q, 3)
         return slopes.unflatten(2, (-1, 2)).mT
-
-    def _images(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return y1 and y2, (B, S, Q, 3) each."""
-        first, second = (self.tangents + slopes).unbind(-1)
-        return first, second
 
     def _sum_of_normals(self, normal: Tensor, displacement: Tensor) -> Tensor:
         """Return the nodal forces (B, N, D) of normals (B, S, Q, 3)."""

@@ -20,7 +20,7 @@ from dpl.fem.assembly import element_loops, lanes
 from dpl.fem.assembly.mean_dilatation import CellVolumes
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
-from dpl.fem.materials.material import CompiledForm, Material
+from dpl.fem.materials.material import Material
 
 Array = NDArray[np.float64]
 Gap = tuple[Array, Array]  # of strains and, with mean dilatation, of volume changes
@@ -48,7 +48,7 @@ class Kernels:
         They are copies because sending a problem to a worker moves the memory of its tensors.
 
         Args:
-            material: The law, which has a `compiled_form`.
+            material: A law that has a `compiled_form`.
             cells: Nodes of each cell, (E, A).
             reference: Gradients of the shape functions of the reference element, (Q, A, D).
             dN: Those of the cells, (E or 1, Q, A, D), reference times inverse Jacobian.
@@ -81,13 +81,14 @@ class Kernels:
         self._set_law(material)
 
     def _set_law(self, material: Material) -> None:
-        form = form_of(material)
+        form = material.compiled_form
+        assert form is not None
         law = Law.of(form, element_loops.SOURCES)
         if self._law is None or self._law[0] != law:
             volumetric = self._volumes is not None and material.finite
             needs = max(required_terms(form), int(volumetric))
             self._law = law, needs, float(material.finite)
-        self._constants = as_columns(material.constants)
+        self.constants = as_columns(material.constants)
         self._frames = frames_of(material)
         self._bulk = None
         if self._volumes is not None:
@@ -108,17 +109,12 @@ class Kernels:
         their own moduli.
         """
         law, needs, finite = self._law
-        moduli, volumes = self._constants[member if len(self._constants) > 1 else 0], None
+        moduli, volumes = self.constants[member if len(self.constants) > 1 else 0], None
         if self._bulk is not None:
             volumes = self.functions, self._bulk[member if len(self._bulk) > 1 else 0]
         law_arguments = law, moduli, self._frames, needs, finite
         arguments = *law_arguments, u, gap, *self._body, volumes, self.places, force, values
         return 1 + call_compiled(element_loops.add_system, *arguments)
-
-    @property
-    def n_members(self) -> int:
-        """Number of the members of a batch that have their own moduli, or 1."""
-        return len(self._constants)
 
     @property
     def _body(self) -> tuple[Any, ...]:
@@ -157,12 +153,8 @@ class CompiledLoops(NamedTuple):
     def linearise(
         self, displacement: Tensor, gap: Sequence[Gap] | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return force (1, N, D), tangent (1, nnz) and min det C of the mixed points (1,).
-
-        Raises:
-            ValueError: The members of a batch have different moduli.
-        """
-        if any(group.n_members > 1 for group in self.groups):
+        """Return force (1, N, D), tangent (1, nnz) and min det C of the mixed points (1,)."""
+        if any(len(group.constants) > 1 for group in self.groups):
             raise ValueError("parameters must be the same for all loads; linearise them one by one")
         u = displacement[0].detach().contiguous().numpy()
         force, values = np.zeros(u.shape), np.zeros(self.n_entries + SPARE)
@@ -188,13 +180,6 @@ class CompiledLoops(NamedTuple):
         return zip(self.groups, [NO_GAP] * len(self.groups) if gap is None else gap, strict=True)
 
 
-def form_of(material: Material) -> CompiledForm:
-    """Return the compiled form of a law that has one."""
-    form = material.compiled_form
-    assert form is not None
-    return form
-
-
 def constants_of(material: Material) -> Array:
     """Return the constants of a law with one frame in each cell, (B or 1, E or 1, n).
 
@@ -208,10 +193,10 @@ def frames_of(material: Material) -> Array:
 
     They are a copy: sending a problem to a worker moves the memory of its tensors.
     """
-    frames = form_of(material).frames
-    if frames is None:
+    form = material.compiled_form
+    if form is None or form.frames is None:
         return np.zeros((1, 1, 0))
-    return frames.flatten(2).contiguous().numpy().copy()
+    return form.frames.flatten(2).contiguous().numpy().copy()
 
 
 def as_columns(values: Sequence[Any]) -> Array:
@@ -245,27 +230,19 @@ def call_compiled(kernel: Any, law: Law, *arguments: Any) -> Any:
                 folder.mkdir(parents=True, exist_ok=True)
                 lock = stack.enter_context((folder / "kernels.lock").open("w"))
                 fcntl.flock(lock, fcntl.LOCK_EX)
-            if variant not in _LOADED and parent_process() is None:
-                stack.enter_context(_announced())
+        if variant not in _LOADED and parent_process() is None:
+            timer = threading.Timer(PATIENCE, _announce)
+            timer.daemon = True
+            timer.start()
+            stack.callback(timer.cancel)
         result = kernel(law, *arguments)
     _LOADED.add(variant)
     return result
 
 
-@contextlib.contextmanager
-def _announced() -> Iterator[None]:
-    """Say on stderr that kernels are compiled if the block takes more than two seconds."""
-    timer = threading.Timer(PATIENCE, _announce)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-
-
 @cache  # once in a process
 def _announce() -> None:
+    """Say on stderr that kernels are compiled."""
     print(COMPILING, file=sys.stderr, flush=True)
 
 

@@ -61,17 +61,8 @@ def gather(field, nodes, dim, out):
 
 @njit
 def gather_constants(c, start, count, out):
-    """Copy the constants of a block of cells, or other numbers, from c (E, n) to (n, SIMD_WIDTH).
-
-    Those of all cells (1, n) are copied for the first block only.
-    """
-    several = c.shape[0] > 1
-    if not several and start > 0:
-        return
-    for lane in range(SIMD_WIDTH):
-        cell = start + min(lane, count - 1) if several else 0
-        for k in range(c.shape[1]):
-            out[k, lane] = c[cell, k]
+    """Copy the constants of a block of cells, or other numbers, from c (E or 1, n) to `out`."""
+    gather_frame(c.reshape(c.shape[0], 1, c.shape[1]), 0, start, count, out[: c.shape[1]])
 
 
 @njit
@@ -106,8 +97,20 @@ def slopes_of_cell(reference, ue, G):
     """Set G (rows 9 q + 3 i + d) to the reference gradients of ue (rows 3 a + i) at the points."""
     if reference is None:
         trilinear_slopes(ue, G)
-    else:
-        table_slopes(reference, ue, G)
+        return
+    total = registers(9)
+    for q in range(reference.shape[0]):
+        for r in range(9):
+            store(total, r, 0.0)
+        for a in range(reference.shape[1]):
+            g0, g1, g2 = reference[q, a, 0], reference[q, a, 1], reference[q, a, 2]
+            for i in range(3):
+                u, r = load(ue, 3 * a + i), 3 * i
+                store(total, r, load(total, r) + u * g0)
+                store(total, r + 1, load(total, r + 1) + u * g1)
+                store(total, r + 2, load(total, r + 2) + u * g2)
+        for r in range(9):
+            store(G, 9 * q + r, load(total, r))
 
 
 @inlined
@@ -128,44 +131,7 @@ def forces_of_cell(reference, P, fe):
     """
     if reference is None:
         trilinear_forces(P, fe)
-    else:
-        table_forces(reference, P, fe)
-
-
-@inlined
-def stiffness_of_cell(reference, A, dim, K):
-    """Set K, rows (pair of nodes a <= b, i, k), to the sum over the points of the moduli A.
-
-    The rows Q pair + q of A are those of `constitutive_kernels.nominal_moduli` between the
-    directions of the reference element.
-    """
-    if reference is None:
-        trilinear_stiffness(A, K)
-    else:
-        table_stiffness(reference, A, dim, K)
-
-
-@inlined
-def table_slopes(reference, ue, H):
-    """Set H to the reference gradients of ue by the table."""
-    total = registers(9)
-    for q in range(reference.shape[0]):
-        for r in range(9):
-            store(total, r, 0.0)
-        for a in range(reference.shape[1]):
-            g0, g1, g2 = reference[q, a, 0], reference[q, a, 1], reference[q, a, 2]
-            for i in range(3):
-                u, r = load(ue, 3 * a + i), 3 * i
-                store(total, r, load(total, r) + u * g0)
-                store(total, r + 1, load(total, r + 1) + u * g1)
-                store(total, r + 2, load(total, r + 2) + u * g2)
-        for r in range(9):
-            store(H, 9 * q + r, load(total, r))
-
-
-@inlined
-def table_forces(reference, P, fe):
-    """Set fe to the forces of stresses P between components and reference directions."""
+        return
     total = registers(3)
     for a in range(reference.shape[1]):
         for i in range(3):
@@ -181,8 +147,15 @@ def table_forces(reference, P, fe):
 
 
 @inlined
-def table_stiffness(reference, A, dim, K):
-    """Set K to the sum of g_a A g_b over the points, g the reference gradients of the nodes."""
+def stiffness_of_cell(reference, A, dim, K):
+    """Set K, rows (pair of nodes a <= b, i, k), to the sum over the points of the moduli A.
+
+    The rows Q pair + q of A are those of `constitutive_kernels.nominal_moduli` between the
+    directions of the reference element.
+    """
+    if reference is None:
+        trilinear_stiffness(A, K)
+        return
     C, Q = registers(27), reference.shape[0]
     for r in range(K.shape[0]):
         store(K, r, 0.0)

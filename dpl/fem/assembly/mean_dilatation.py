@@ -55,10 +55,7 @@ class CellVolumes(NamedTuple):
     def of(cls, points: Tensor, dV: Tensor, *, linear: bool) -> "CellVolumes":
         """Return constants, or with `linear` linear functions, in cells.
 
-        Args:
-            points: Quadrature points, (E or 1, Q, D) [-].
-            dV: Their volumes, (E or 1, Q) [-].
-            linear: False for constants.
+        The quadrature points are (E or 1, Q, D) [-], their volumes dV (E or 1, Q) [-].
         """
         one = torch.ones_like(dV)[..., None]
         offsets = points - points.mean(1, keepdim=True)
@@ -136,12 +133,7 @@ class PointwiseLaw:
 
 
 class MixedGap(NamedTuple):
-    """Gap of the mixed integration points of a body with mean dilatation.
-
-    Attributes:
-        strain: Strain of u minus that of the points, (B, E, Q, 3, 3) [-].
-        volume: Coefficients of the projected J of u minus those of the cells, (B, E, M).
-    """
+    """Gap of strains, (B, E, Q, 3, 3), and of the coefficients of the projected J, (B, E, M)."""
 
     strain: Tensor
     volume: Tensor
@@ -229,19 +221,15 @@ class MeanDilatation(PointwiseLaw):
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
         return cofactor(H + eye) if self.material.finite else eye.expand_as(H)
 
-    @property
-    def _point_bulk(self) -> Tensor:
-        return self.volumes.point_bulk(self.material)
-
     def _volumetric_energy(self, j: Tensor) -> Tensor:
         """Return U at J - 1 = j, (B, E, Q) [-]."""
         own = j * (2 + j) / 4 - torch.log1p(j) / 2 if self.material.finite else j.square() / 2
-        return self.material.volumetric_energy(j) - self._point_bulk * own
+        return self.material.volumetric_energy(j) - self.volumes.point_bulk(self.material) * own
 
     def _pressure(self, j: Tensor) -> Tensor:
         """Return U' at J - 1 = j, (B, E, Q) [-]."""
         own = j * (2 + j) / (2 + 2 * j) if self.material.finite else j
-        return self.material.pressure(j) - self._point_bulk * own
+        return self.material.pressure(j) - self.volumes.point_bulk(self.material) * own
 
     def _pressure_and_modulus(self, j: Tensor) -> tuple[Tensor, Tensor]:
         """Return U' and U'' at J - 1 = j, (B, E, Q) [-]."""

@@ -33,49 +33,35 @@ class Law:
     """A law as an argument of a kernel.
 
     Attributes:
-        material: Class of the isotropic law.
-        n_constants: Number of its constants.
-        sources: Source code of the kernels, for the digest.
-        fibres: Class of the energy of fibres, see `CompiledForm`, or None.
-        n_fibre_constants: Number of its constants. They follow those of the isotropic law, and the
+        kind: Its type in numba. The constants of fibres follow those of the isotropic law, and the
             entries of the fibre frame, row by row, follow them.
     """
 
-    material: type[Any]
-    n_constants: int
-    sources: str
-    fibres: type[Any] | None = None
-    n_fibre_constants: int = 0
+    kind: _LawType
 
     @classmethod
     def of(cls, form: CompiledForm, sources: str) -> "Law":
-        """Return a law as an argument of a kernel."""
-        law, fibres = form.isotropic, form.fibres
-        counts = len(law.constants), 0 if fibres is None else len(fibres.constants)
-        kind = None if fibres is None else type(fibres)
-        return cls(type(law), counts[0], sources, kind, counts[1])
-
-    @property
-    def kind(self) -> _LawType:
-        """The law's type in numba."""
-        return _kind(self)
+        """Return a law as an argument of the kernels with some source code."""
+        parts = (form.isotropic, form.fibres) if form.fibres else (form.isotropic,)
+        return _law(tuple((type(part), len(part.constants)) for part in parts), sources)
 
 
 @cache
-def _kind(law: Law) -> _LawType:
-    functions: list[Any] = [law.material.invariant_derivatives]
-    functions += [law.fibres.strain_derivatives] if law.fibres else []
-    code = repr([_code_of(function) for function in functions]) + law.sources
+def _law(parts: tuple[tuple[type[Any], int], ...], sources: str) -> Law:
+    (material, at), *fibres = parts
+    functions: list[Any] = [material.invariant_derivatives]
+    functions += [kind.strain_derivatives for kind, _ in fibres]
+    code = repr([_code_of(function) for function in functions]) + sources
     digest = hashlib.sha256(code.encode()).hexdigest()[:16]
-    name = f"{law.material.__qualname__}{law.fibres.__qualname__ if law.fibres else ''}{digest}"
+    name = "".join(kind.__qualname__ for kind, _ in parts) + digest
     if name not in _COMPILED:
-        invariants, *fibres = map(_compile, functions)
-        at = law.n_constants
+        invariants, *compiled = map(_compile, functions)
+        rows = [range(at, at + count) for _, count in fibres]
         _COMPILED[name] = (
             _call_of_invariants(invariants, at),
-            _call_of_fibres(fibres[0], range(at, at + law.n_fibre_constants)) if fibres else None,
+            _call_of_fibres(compiled[0], rows[0]) if fibres else None,
         )
-    return _LawType(name)
+    return Law(_LawType(name))
 
 
 def _call_of_invariants(function: Any, count: int) -> Any:

@@ -17,11 +17,9 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 Array = NDArray[np.float64]
+Samples = tuple[Array, Array]  # positions (S, D) and volumes (S,) of points with known values
 NEAR = 0.1  # squared distance, over that of the farthest sample, at which weights have half of dV
 SINGULAR = 1e-4  # smallest variance of samples along a direction, over their squared distance
-
-
-Samples = tuple[Array, Array]  # positions (S, D) and volumes (S,) of points with known values
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +39,9 @@ class Recovery:
         cls, points: Array, cells: NDArray[np.int64], boundary: NDArray[np.bool_], at: Array,
         dV: Array, degree: int,
     ) -> Self:  # fmt: skip
-        """Return the recovery of a mesh.
+        """Return the recovery of a mesh with nodes (N, D), cells (E, A) and a mask of nodes (N,).
+
+        The quadrature points `at` are (E, Q, D), and their volumes dV (E, Q).
 
         Quadratic elements: the samples are the quadrature points of the cells at the node.
 
@@ -52,14 +52,6 @@ class Recovery:
 
         The function is constant in directions in which no samples differ. With none that differ
         in any direction, the value is the mean over the samples.
-
-        Args:
-            points: Nodes, (N, D).
-            cells: Nodes of each cell, (E, A).
-            boundary: Mask of the nodes on the boundary, (N,).
-            at: Quadrature points, (E, Q, D).
-            dV: Their volumes, (E, Q).
-            degree: Degree of the displacement, 1 or 2.
         """
         count, quadrature = dV.shape
         all_points = at.reshape(-1, at.shape[-1]), dV.ravel()

@@ -30,18 +30,6 @@ def set_moduli(law, c, needs, finite, H, A):
     point.nominal_moduli(F, unit, 0, D, S, 1.0, finite, A, 0, 1)
 
 
-@inlined
-def set_gradients(u, cells, dN, start, count, H):
-    """Set H (rows 3 i + j) to the gradients of u in a block of cells with one point each."""
-    H[:] = 0.0
-    for lane in range(SIMD_WIDTH):
-        cell = start + min(lane, count - 1)
-        for a in range(cells.shape[1]):
-            for i in range(u.shape[1]):
-                for j in range(u.shape[1]):
-                    H[3 * i + j, lane] += u[cells[cell, a], i] * dN[cell, 0, a, j]
-
-
 @njit(error_model="numpy", cache=True)
 def moduli_change_product(law, c, needs, finite, u, cells, dN, dV, basis, out):
     """Set out to dV (A(H) - A(0)) G of cells with one point each, (C, D D, R) in float32.
@@ -57,7 +45,12 @@ def moduli_change_product(law, c, needs, finite, u, cells, dN, dV, basis, out):
         gather_constants(c, start, count, constants)
         H[:] = 0.0
         set_moduli(law, constants, needs, finite, H, rest)
-        set_gradients(u, cells, dN, start, count, H)
+        for lane in range(SIMD_WIDTH):
+            cell = start + min(lane, count - 1)
+            for a in range(cells.shape[1]):
+                for i in range(dim):
+                    for j in range(dim):
+                        H[3 * i + j, lane] += u[cells[cell, a], i] * dN[cell, 0, a, j]
         set_moduli(law, constants, needs, finite, H, A)
         for lane in range(count):
             for i in range(dim):

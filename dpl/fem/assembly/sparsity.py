@@ -46,22 +46,15 @@ class Pattern:
             number=_numbered(free),
         )
 
-    def between(self, rows: Integers, columns: Integers) -> NDArray[np.int64]:
-        """Return the positions (S, D) of the diagonal entries of pairs of nodes (S,) and (S,)."""
-        row, column = self.number[rows], self.number[columns]
-        found = self.positions(row, column)
-        return np.where(column >= row, found, len(self.indices))
+    def positions(self, row: Integers, column: Integers) -> Integers:
+        """Return the positions of entries of pairs of degrees of freedom that belong to one cell.
 
-    def positions(self, first: Integers, second: Integers) -> NDArray[np.int64]:
-        """Return the positions of the entries of pairs of free degrees of freedom, in any order.
-
-        The pairs must belong to one cell. The result is nnz where a number is -1.
+        The result is nnz for pairs below the diagonal and for fixed ones, whose number is -1.
         """
-        row, column = np.minimum(first, second), np.maximum(first, second)
         owner = np.repeat(np.arange(self.size), np.diff(self.indptr))
         codes = owner * self.size + self.indices
         found = np.searchsorted(codes, row * self.size + column)
-        return np.where(row >= 0, found, len(codes))
+        return np.where((row >= 0) & (row <= column), found, len(codes))
 
 
 def _numbered(free: NDArray[np.bool_]) -> Integers:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly import reduced_loops
-from dpl.fem.assembly.kernels import call_compiled, constants_of, form_of
+from dpl.fem.assembly.kernels import call_compiled, constants_of
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.materials.heterogeneous import one_law
@@ -98,7 +98,9 @@ class SampledTangent:
 
     @cached_property
     def _required_terms(self) -> int:
-        return required_terms(form_of(one_law(self.problem.reference.material)))
+        form = one_law(self.problem.reference.material).compiled_form
+        assert form is not None
+        return required_terms(form)
 
     @cached_property
     def _terms(self) -> tuple[StiffnessTerms, Array]:
