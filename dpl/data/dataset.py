@@ -194,8 +194,10 @@ class DataSet:
                 while unmerged and unmerged[0][2] <= tried:
                     store.merge(*unmerged.pop(0)[:2])
 
-            limits = {"workers": self.workers, "timeout": self.timeout}
-            for solved in solve_loads(self.scene, jobs(), stop=stop, guess=guess, **limits):
+            workers, timeout = self.workers, self.timeout
+            for solved in solve_loads(
+                self.scene, jobs(), workers=workers, timeout=timeout, stop=stop, guess=guess
+            ):
                 store.write(solved)
                 tried.add(solved.job)
                 merge_complete_blocks()

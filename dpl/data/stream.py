@@ -144,11 +144,9 @@ class SampleStream:
             found = early.pop(number, None)
             if found is not None and found.accepted:
                 point = torch.from_numpy(found.point)[None]
-                fields = map(torch.from_numpy, (found.force, found.displacement))
-                yield (
-                    number,
-                    Sample(*fields, loads.young_at(point)[0], loads.parameters_at(point)[0]),
-                )
+                force, displacement = map(torch.from_numpy, (found.force, found.displacement))
+                young, parameters = loads.young_at(point)[0], loads.parameters_at(point)[0]
+                yield number, Sample(force, displacement, young, parameters)
 
     def _numbers(self) -> Iterator[int]:
         return itertools.count(self.first + self.rank, self.world_size)

@@ -300,7 +300,8 @@ class Store:
         Lines that do not give these numbers are left out.
         """
         keys = "loads", "seconds", "core_seconds"
-        rows = [[line.get(key) for key in keys] for line in read_jsonl(self.folder / JOURNAL)]
+        lines = read_jsonl(self.folder / JOURNAL)
+        rows: list[list[Any]] = [[line.get(key) for key in keys] for line in lines]
         valid = [
             row
             for row in rows
