@@ -158,10 +158,6 @@ class DataModule(L.LightningDataModule):
             data,
             self.batch_size,
             sampler=sampler,
-            collate_fn=_identity,
+            collate_fn=lambda batch: batch,
             generator=torch.Generator(),  # the random numbers of the training stay untouched
         )
-
-
-def _identity(batch: Any) -> Any:
-    return batch

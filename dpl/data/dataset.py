@@ -2,6 +2,9 @@
 
 import json
 import math
+import os
+import platform
+import socket
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -19,11 +22,10 @@ from dpl.data.solving.solve import Guess, LoadKey, SolvedLoad
 from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
 from dpl.data.storage.acceptance import bias_warning
 from dpl.data.storage.integrity import repair, verify
-from dpl.data.storage.journal import Session
-from dpl.data.storage.store import FORMAT, STREAMS, Store, blocks
+from dpl.data.storage.store import FORMAT, JOURNAL, STREAMS, Store, blocks
 from dpl.scene import Scene
 from dpl.system.checks import check_range
-from dpl.system.files import exclusive_lock, write_file
+from dpl.system.files import append_jsonl, exclusive_lock, write_file
 from dpl.version import __version__
 
 MAX_LOADS = 10**7  # in a split
@@ -40,9 +42,7 @@ class DataSet:
         scene: Scene of the loads.
         folder: Folder of the data set; None: named after the scene's fingerprint and the seed.
         seed: Seed of the loads.
-        train: Number of loads to train on.
-        val: Number of loads to validate on.
-        test: Number of loads to test on.
+        train, val, test: Numbers of loads of the splits.
         workers: Number of processes that solve, one core each; 0: solve in this process.
         timeout: Time limit for a load [s]; None: no limit.
         shard: Index of this process among `shards` processes that share the work.
@@ -114,12 +114,8 @@ class DataSet:
     def fill(self) -> Store:
         """Solve the missing loads under a progress bar; return the data set.
 
-        After the first SIGINT or SIGTERM, the solves in progress are finished. Solved loads are
-        kept in any case.
-
-        Raises:
-            DataSetError: The folder holds something else, or another process writes there.
-            KeyboardInterrupt: The run was interrupted.
+        After the first SIGINT or SIGTERM, the solves in progress are finished; then
+        KeyboardInterrupt or SystemExit is raised. Solved loads are kept in any case.
         """
         self._solve_with_progress(self.missing())
         if warning := bias_warning(self.store.acceptance()):
@@ -137,11 +133,7 @@ class DataSet:
                 stop.exit()
 
     def create(self) -> None:
-        """Write `scene.json` if it is missing.
-
-        Raises:
-            DataSetError: The folder holds something else.
-        """
+        """Write `scene.json` if it is missing; raise DataSetError if the folder is no data set."""
         folder, scene = self.store.folder, self.scene
         if self.store.exists():
             return
@@ -168,16 +160,19 @@ class DataSet:
 
         Args:
             loads: Splits with numbers of loads, in the order of the solves; read when they are due.
-            stop: Once its truth value is True, no further load is started.
-            guess: See `solve_loads`.
+            stop, guess: See `solve_loads`.
 
         Raises:
             DataSetError: The folder holds something else, or another process writes there.
+            RuntimeError: Workers die repeatedly.
         """
         self.create()
         store = self.store
         with exclusive_lock(store.folder, self.shard, self.shards):
-            remove_unfinished(store.folder)
+            for path in store.folder.rglob(".*.part"):  # of killed processes
+                with suppress(FileNotFoundError):
+                    if time.time() - path.stat().st_mtime > PARTIAL_FILE_AGE:
+                        path.unlink()
             for block in store.scattered(self.shard, self.shards):  # of an interrupted session
                 store.merge(*block)
             tried = {
@@ -199,13 +194,9 @@ class DataSet:
                 while unmerged and unmerged[0][2] <= tried:
                     store.merge(*unmerged.pop(0)[:2])
 
+            workers, timeout = self.workers, self.timeout
             for solved in solve_loads(
-                self.scene,
-                jobs(),
-                workers=self.workers,
-                timeout=self.timeout,
-                stop=stop,
-                guess=guess,
+                self.scene, jobs(), workers=workers, timeout=timeout, stop=stop, guess=guess
             ):
                 store.write(solved)
                 tried.add(solved.job)
@@ -214,11 +205,7 @@ class DataSet:
             merge_complete_blocks()  # of loads that another session had tried
 
     def verify(self) -> Iterator[str]:
-        """Yield one line for each flaw of the data set, and for missing loads.
-
-        Raises:
-            DataSetError: There is no data set.
-        """
+        """Yield one line for each flaw of the data set, and for missing loads."""
         total = len(self.store.files())
         for path, flaw in progress.track(verify(self.store), "verifying files", total=total):
             if flaw:
@@ -244,14 +231,6 @@ class DataSet:
         return self.fill()
 
 
-def remove_unfinished(folder: Path) -> None:
-    """Remove the files that killed processes left unfinished in a folder or below it."""
-    for path in folder.rglob(".*.part"):
-        with suppress(FileNotFoundError):
-            if time.time() - path.stat().st_mtime > PARTIAL_FILE_AGE:
-                path.unlink()
-
-
 class LoadSolver:
     """Solves loads of a data set under progress bars, by default in the caller's thread."""
 
@@ -264,35 +243,51 @@ class LoadSolver:
         stop: object = None,
         thread: bool = False,
     ) -> None:
-        """Start to solve.
+        """Start to solve, see `DataSet.solve`.
 
-        Args:
-            dataset: The data set.
-            loads: Splits with numbers of loads, in the order of the solves; read when they are due.
-            guess: See `solve_loads`.
-            stop: See `solve_loads`.
-            thread: A thread supervises the workers and writes the solved loads meanwhile.
+        With `thread`, a thread supervises the workers and writes the solved loads meanwhile.
         """
-        self._dataset, self._loads, self._guess = dataset, loads, guess
+        self._dataset = dataset
         self._tried = {split: dataset.store.tried(split) for split in STREAMS}
         self._first = dict.fromkeys(STREAMS, 0)  # all loads before these have been tried
-        self._session = Session(workers=dataset.workers)
+        self._done = 0  # loads of this session
         self._news = ""
         self._solved = Background(
-            lambda own: self._solve(own if stop is None else stop), thread=thread
+            lambda own: self._solve(loads, own if stop is None else stop, guess), thread=thread
         )
 
-    def _solve(self, stop: object) -> Generator[LoadKey, None, None]:
-        store, session = self._dataset.store, self._session
-        splits = {store.stream(split): split for split in STREAMS}
+    def _solve(
+        self, loads: Iterable[tuple[str, Sequence[int]]], stop: object, guess: Guess | None
+    ) -> Generator[LoadKey, None, None]:
+        """Yield the keys of solved loads; append a line to the journal at the end."""
+        folder, splits = self._dataset.store.folder, list(STREAMS)
+        date, start = time.strftime("%Y-%m-%d %H:%M:%S"), time.perf_counter()
+        accepted, core_seconds = 0, 0.0
         try:
-            with closing(self._dataset.solve(self._loads, stop, self._guess)) as solving:
+            with closing(self._dataset.solve(loads, stop, guess)) as solving:
                 for solved in solving:
-                    self._news = session.count(solved.accepted, solved.seconds)
-                    self._tried[splits[solved.job.seed]].add(solved.job.number)
+                    self._done += 1
+                    accepted += solved.accepted
+                    core_seconds += solved.seconds
+                    rate = self._done / (time.perf_counter() - start)
+                    rejected = self._done - accepted
+                    self._news = f"{accepted} accepted, {rejected} rejected, {rate:.1f}/s"
+                    self._tried[splits[solved.job.seed[1]]].add(solved.job.number)
                     yield solved.job
         finally:
-            session.append_to_journal(store.folder)
+            if self._done and folder.is_dir():
+                line = {
+                    "started": date,
+                    "machine": socket.gethostname(),
+                    "process": os.getpid(),
+                    "python": platform.python_version(),
+                    "dpl": __version__,
+                    "workers": self._dataset.workers,
+                    "loads": self._done,
+                    "seconds": round(time.perf_counter() - start, 3),
+                    "core_seconds": round(core_seconds, 3),
+                }
+                append_jsonl(folder / JOURNAL, line)
 
     def count(self, split: str) -> int:
         """Return the number of loads of a split before the first one that has not been tried."""
@@ -305,14 +300,7 @@ class LoadSolver:
     ) -> None:
         """Wait until the first loads of each split have been tried, or there is no load left.
 
-        Args:
-            sizes: Number of loads, by split.
-            until: Time of `time.monotonic` at which the wait ends [s]; None: no limit.
-            show: Show a progress bar.
-
-        Raises:
-            DataSetError: The folder holds something else, or another process writes there.
-            RuntimeError: Workers die repeatedly.
+        The wait ends `until` a time of `time.monotonic` [s]. Errors are those of `DataSet.solve`.
         """
 
         def done() -> int:
@@ -321,12 +309,12 @@ class LoadSolver:
         self._wait(done, sum(sizes.values()), until=until, show=show)
 
     def finish(self, total: int) -> None:
-        """Solve all loads, `total` in number, and merge files; errors are those of `wait`."""
-        self._wait(lambda: self._session.loads, total or 1, show=total > 0)
+        """Solve all loads, `total` in number, and merge files."""
+        self._wait(lambda: self._done, total or 1, show=total > 0)
         self._solved.get()  # merges the last files
 
     def _wait(
-        self, done: Callable[[], int], wanted: int, *, until: float | None = None, show: bool
+        self, done: Callable[[], int], wanted: int, *, show: bool, until: float | None = None
     ) -> None:
         with progress.Progress(
             progress.TextColumn("solving loads"),

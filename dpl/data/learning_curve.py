@@ -17,8 +17,7 @@ class CurvePoint(NamedTuple):
     Attributes:
         loads: Number of training loads.
         seconds: Wall time since the start of the training [s].
-        median: Median over held-out loads of the relative L2 error [-].
-        worst: Largest relative L2 error [-].
+        median, worst: Median and maximum over held-out loads of the relative L2 error [-].
         e_mean: See `dpl.training.metrics.METRICS` [-].
     """
 
@@ -35,11 +34,9 @@ class CurvePoint(NamedTuple):
 
 
 def loads_for(points: Sequence[CurvePoint], error: float) -> int | None:
-    """Return the number of loads at which a median error is expected.
+    """Return the number of loads at which a median error is expected; None if there is none.
 
     A power law, error = a loads^-b, is fitted to the last points by least squares of logarithms.
-
-    Returns None if there are not two points, the errors do not decrease or the number is too large.
     """
     last = [point for point in points[-POINTS:] if point.median > 0]
     if len(last) < 2 or not all(math.isfinite(point.median) for point in last):
@@ -62,7 +59,8 @@ def describe(points: Sequence[CurvePoint], error: float) -> str:
     needed = loads_for(points, error)
     if needed is None:
         return str(last)
-    return f"{last}; about {_rounded(max(needed, last.loads + 1))} loads for {_percent(error)}"
+    needed = round(float(f"{max(needed, last.loads + 1):.2g}"))
+    return f"{last}; about {needed} loads for {_percent(error)}"
 
 
 def in_words(errors: Mapping[str, float]) -> str:
@@ -73,9 +71,3 @@ def in_words(errors: Mapping[str, float]) -> str:
 
 def _percent(ratio: float) -> str:
     return f"{100 * ratio:.2g} %"
-
-
-def _rounded(count: int) -> int:
-    """Return a number rounded to two digits."""
-    unit: int = 10 ** max(0, len(str(count)) - 2)
-    return round(count / unit) * unit

@@ -1,6 +1,6 @@
 """Training data that another solver computed: pairs of forces and displacements in files."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -78,17 +78,13 @@ class PairData(DataModule):
         Args:
             scene: Body, law and supports, with one Young's modulus and no other ranges.
             path: File of arrays or folder of VTK files, see `dpl.fem.mesh.nodal_fields`.
-            force: Name of the nodal forces.
-            displacement: Name of the displacements.
+            force, displacement: Names of the nodal forces and of the displacements.
             force_unit: Unit of the forces [N].
             length_unit: Unit of displacements and points [m].
             tol: Largest relative residual of a pair that is used [-].
-            val: Number of pairs to validate on.
-            test: Number of pairs to test on.
+            val, test: Numbers of pairs to validate and to test on.
             seed: Seed of the division.
-            shuffle_seed: Seed of the order of the samples in the batches.
-            batch_size: Samples in a batch.
-            symmetry: Train also on the images of each sample under the symmetries of the body.
+            shuffle_seed, batch_size, symmetry: See `DataModule`.
 
         Raises:
             ValueError: The files cannot be read or do not belong to the body, or too few pairs are
@@ -98,7 +94,8 @@ class PairData(DataModule):
         names, units = (force, displacement), (force_unit, length_unit)
         self.pairs = read_pairs(scene, self._path, names, units)
         load, u = self.pairs.load, self.pairs.displacement
-        self.residuals = torch.cat(list(_residuals(scene.problem, u, load.force)))
+        batches = zip(u.split(BATCH), load.force.split(BATCH), strict=True)
+        self.residuals = torch.cat([scene.problem.relative_residual(*pair) for pair in batches])
         wrong = torch.where(scene.problem.free, 0.0, u - scene.problem.prescribed)
         self.support_errors = _largest(wrong) / _largest(u).clamp(min=1e-300)
         self._usable = ((self.residuals <= tol) & (self.support_errors <= tol)).nonzero()[:, 0]
@@ -173,15 +170,10 @@ def read_pairs(
 
 
 def fit_law(body: Problem, force: Tensor, displacement: Tensor) -> LawFit:
-    """Return the constants of the law of a body with the smallest residuals of some pairs.
+    """Return the constants of a law with the smallest residuals of forces (S, N, D) and solutions.
 
     Young's modulus is a linear least-squares fit. If the law has a number `poisson`, it is found by
     bounded minimisation (Brent 1973).
-
-    Args:
-        body: Body and law.
-        force: Nodal forces, (S, N, D) [-].
-        displacement: Displacements, (S, N, D) [-].
     """
     if not isinstance(getattr(body.material, "poisson", None), float):
         return _fit_modulus(body, force, displacement)
@@ -205,11 +197,6 @@ def _fit_modulus(
     young = (given * computed).sum() / computed.square().sum()
     residual = (given - young * computed).square().sum(dim=1).mean().sqrt()
     return LawFit(float(young), poisson, float(residual))
-
-
-def _residuals(body: Problem, displacement: Tensor, force: Tensor) -> Iterable[Tensor]:
-    for pair in zip(displacement.split(BATCH), force.split(BATCH), strict=True):
-        yield body.relative_residual(*pair)
 
 
 def _largest(field: Tensor) -> Tensor:

@@ -1,23 +1,27 @@
-"""Sources of the training samples of a data module: a data set on disk, or an endless stream."""
+"""Sources of the training samples of a data module; `Stream` is in `dpl.data.stream`."""
 
+import math
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from typing import Any
 
-from dpl.data.dataset import DataSet, LoadSolver
-from dpl.data.learning_curve import CurvePoint, in_words
-from dpl.data.replay_buffer import ReplayBuffer
+from dpl.data.dataset import MAX_LOADS, DataSet, LoadSolver
+from dpl.data.learning_curve import CurvePoint, describe, in_words, loads_for
 from dpl.data.solving.solve import Guess
 from dpl.data.storage.store import SHARD_SIZE, Store
-from dpl.data.stream import SampleStream
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
-from dpl.system.memory import machine, refuse_beyond
 from dpl.system.threads import leave_cores, one_thread
 
 MAX_COUNT = 10**9  # of batches, and of samples in a batch
 HELD_OUT = 32  # smallest number of held-out loads of a fit, as far as there are as many
 MIN_REST = 128  # training loads that are not solved for which a fit to the first ones saves time
+PATIENCE = 2  # fits without gain after which the growth ends
+MIN_GAIN = 0.95  # ratio of errors from which a fit is one without gain
+# ratio of the training loads of a fit to those of the one before
+MIN_FACTOR = math.sqrt(2)
+MAX_FACTOR = 4
 
 
 class Source:
@@ -48,14 +52,8 @@ class Source:
     def fits(self, dataset: DataSet, guess: Guess | None = None) -> Iterator[dict[str, int]]:
         """Yield the numbers of loads, by split, of each fit of a model in closed form.
 
-        Args:
-            dataset: The data set; its missing loads are solved.
-            guess: Prediction of the last fit, from which loads are solved.
-
-        Raises:
-            DataSetError: The folder holds something else, or another process writes there.
-            KeyboardInterrupt: The solves were interrupted.
-            ValueError: The source is no set of solved loads.
+        Missing loads of the data set are solved; `guess` is the prediction of the last fit, from
+        which they are solved.
         """
         raise ValueError("a model in closed form is fitted to solved loads; set data=offline")
 
@@ -64,7 +62,7 @@ class Source:
         return None
 
     def record(self, loads: int, errors: Mapping[str, float]) -> str:
-        """Record the held-out errors of a fit to a number of loads; return them in words."""
+        """Record the errors of a fit to a number of loads, see `in_words`; return them in words."""
         return f"{loads} loads: {in_words(errors)}"
 
     def close(self) -> None:
@@ -90,7 +88,7 @@ class Stored(Source):
     def fits(self, dataset: DataSet, guess: Guess | None = None) -> Iterator[dict[str, int]]:
         """Yield the sizes of the data set; before, if many loads are missing, those of a first fit.
 
-        The missing loads are then solved from its predictions, see `Source.fits`.
+        The missing loads are then solved from its predictions.
         """
         first = fit_sizes(SHARD_SIZE, dataset.val)
         if len(dataset.store.missing("train", dataset.train)) > MIN_REST:
@@ -106,93 +104,144 @@ class Stored(Source):
         yield dataset.sizes
 
 
-@dataclass(eq=False)
-class Stream(Source):
-    """Samples that worker processes solve while the network trains, kept in a `ReplayBuffer`.
+class Growing(Source):
+    """Training loads that are solved in the background while a model is fitted to the first ones.
 
-    Attributes:
-        batches: Batches in an epoch.
-        new_per_round: New samples after which batches are drawn again.
-        reuse: Maximum number of uses of a sample.
-        capacity: Number of samples that the replay buffer keeps.
+    After the first `SHARD_SIZE` training loads the model is fitted and its error on held-out loads
+    recorded. The next fit takes `MIN_FACTOR` times as many loads, or more if they are solved
+    already, but not more than the learning curve predicts for the error wanted. The errors of a fit
+    are those of the next training loads: held-out loads that have chosen its ridges and modes give
+    smaller ones.
+
+    The loads are those of the data set of the same seed, in the same order.
     """
 
-    _: KW_ONLY
-    batches: int = 16
-    new_per_round: int = 8
-    reuse: int = 50
-    capacity: int = 4096
+    def __init__(
+        self, *, error: float = 1e-3, minutes: float | None = None, max_train: int = 10_000
+    ) -> None:
+        """Check the arguments.
 
-    def __post_init__(self) -> None:
-        counts = {name: getattr(self, name) for name in ("batches", "new_per_round", "reuse")}
-        check_range(1, MAX_COUNT, **counts)
-        if self.capacity < self.new_per_round:
-            raise ValueError(
-                f"capacity = {self.capacity} must be at least new_per_round = {self.new_per_round}"
-            )
-        self._replay: ReplayBuffer | None = None
-        self._first = 0  # number of loads of the run that this one resumes
-
-    def check(self, scene: Scene, batch_size: int) -> None:
-        """Check the buffer.
-
-        Raises:
-            ValueError: The buffer can never give a batch.
-            MemoryError: The buffer exceeds the memory of the machine.
+        Args:
+            error: Median over held-out loads of the relative L2 error at which the growth ends [-].
+            minutes: Time after which the growth ends [min]; None: no limit.
+            max_train: Largest number of training loads.
         """
-        if self.capacity * self.reuse < batch_size:
-            raise ValueError(
-                f"capacity * reuse = {self.capacity} * {self.reuse} must be at least batch_size = "
-                f"{batch_size}; take a larger data.train.capacity or data.train.reuse"
-            )
-        needed = self.capacity * 2 * 8 * scene.problem.points.numel() / 1e9
-        remedy = "take a smaller data.train.capacity"
-        refuse_beyond(needed, machine(), f"{self.capacity} samples", remedy)
+        if not 0 < error < math.inf:
+            raise ValueError(f"error = {error} must be above 0")
+        if minutes is not None and not minutes > 0:
+            raise ValueError(f"minutes = {minutes} must be above 0 [min], or null")
+        check_range(1, MAX_LOADS, max_train=max_train)
+        self.points: list[CurvePoint] = []
+        self._error, self._minutes, self._max_train = error, minutes, max_train
+        self._start = self._fit_start = time.monotonic()
+        self._fit_seconds = 0.0  # duration of the last fit
+
+    def count(self, store: Store) -> int:
+        """Return the number of training loads of the last fit, or of those that are there."""
+        return self.points[-1].loads if self.points else len(store.tried("train"))
+
+    def fits(self, dataset: DataSet, guess: Guess | None = None) -> Iterator[dict[str, int]]:
+        """Solve loads in the background; yield the numbers of training and held-out loads of fits.
+
+        The errors of each fit have to be recorded before the next one. The loads of validation and
+        test that the data set wants are solved at the end.
+        """
+        if self.is_finished:
+            return
+        leave_cores(dataset.workers)
+        self._start = time.monotonic() - (self.points[-1].seconds if self.points else 0.0)
+        val, loads, thread = dataset.val, self._loads(dataset), dataset.workers > 0
+        self._solver = solver = LoadSolver(dataset, loads, guess=guess, thread=thread)
+        while not self.is_finished:
+            least, most = self._limits()
+            solver.wait(fit_sizes(least, val), until=self._deadline(), show=not self.points)
+            self._fit_start = time.monotonic()
+            available = solver.count("train")
+            while available and solver.count("val") < fit_sizes(available, val)["val"]:
+                available = max(0, available - SHARD_SIZE)
+            size = max(least, min(most, available // SHARD_SIZE * SHARD_SIZE))
+            if available < least:  # the time is over
+                size = max(available, self.points[-1].loads if self.points else 1)
+            yield fit_sizes(size, val)
+        solver.wait({"val": val, "test": dataset.test}, show=True)
+
+    def _loads(self, dataset: DataSet) -> Iterator[tuple[str, range]]:
+        """Yield splits and loads in the order of the solves; the rest once the growth has ended."""
+        val = 0
+        for train in range(0, self._max_train, SHARD_SIZE):
+            if self.is_finished:
+                break
+            end = min(train + SHARD_SIZE, self._max_train)
+            held_out = fit_sizes(end, dataset.val)["val"]
+            yield "val", range(val, held_out)
+            yield "train", range(train, end)
+            val = held_out
+        yield "val", range(val, dataset.val)
+        yield "test", range(dataset.test)
+
+    def _limits(self) -> tuple[int, int]:
+        """Return the smallest and the largest number of training loads of the next fit."""
+        if not self.points:
+            first = min(SHARD_SIZE, self._max_train)
+            return first, first
+        last = self.points[-1].loads
+        needed = loads_for(self.points, self._error) or MAX_LOADS
+        limits = MIN_FACTOR * last, min(MAX_FACTOR * last, needed)
+        shards = (math.ceil(loads / SHARD_SIZE) for loads in limits)
+        least, most = (min(self._max_train, count * SHARD_SIZE) for count in shards)
+        return least, max(least, most)
+
+    def _deadline(self) -> float | None:
+        """Return the time at which a fit has to start to end in time [s]; None: no limit."""
+        if self._minutes is None or not self.points:
+            return None
+        return self._start + 60 * self._minutes - self._fit_seconds
+
+    def unseen(self, store: Store, loads: int) -> Sample | None:
+        """Return the training samples that follow those of a fit, None after the last ones."""
+        assert self._solver is not None  # there are fits while it solves
+        self._solver.wait({"train": loads + SHARD_SIZE}, until=self._deadline())
+        end = min(self._solver.count("train"), loads + SHARD_SIZE)
+        return store.load("train", end, first=loads) if end > loads else None
+
+    def record(self, loads: int, errors: Mapping[str, float]) -> str:
+        """Record the errors of a fit, also with the number of loads that the target may need."""
+        now = time.monotonic()
+        self._fit_seconds = now - self._fit_start
+        self.points.append(CurvePoint(loads, now - self._start, **errors))
+        line = describe(self.points, self._error)
+        reason = self._limit_reached
+        return f"{line}; {reason}" if reason else line
 
     @property
-    def rates(self) -> Mapping[str, float] | None:  # type: ignore[override]
-        """Rates of the stream in the last epoch, see `ReplayBuffer`."""
-        return self._replay.rates if self._replay is not None else None
+    def is_finished(self) -> bool:
+        """True if the last fit meets the error wanted or a limit is reached."""
+        met = self.points and self.points[-1].median <= self._error
+        return bool(met or self._limit_reached)
 
-    def loader(self, data: Any) -> ReplayBuffer:
-        """Return the stream; training is limited to the cores that its workers leave."""
-        leave_cores(data.workers)
-        rank, world_size = data.rank_and_world_size
-        self.close()  # the stream of an earlier training
-        stream = SampleStream(
-            data.scene,
-            data.store.stream("train"),
-            first=self._first,
-            rank=rank,
-            world_size=world_size,
-            workers=data.workers,
-            timeout=data.dataset.timeout,
-        )
-        self._replay = ReplayBuffer(
-            stream,
-            batch_size=data.batch_size,
-            batches=self.batches,
-            new_per_round=self.new_per_round,
-            reuse=self.reuse,
-            capacity=self.capacity,
-            seed=data.shuffle_seed,
-            group=data.group,
-        )
-        return self._replay
-
-    def close(self) -> None:
-        """Stop the workers."""
-        if self._replay is not None:
-            self._replay.stream.close()
+    @property
+    def _limit_reached(self) -> str:
+        """Limit that the last fit has reached, in words; empty if there is none."""
+        if not self.points or (last := self.points[-1]).median <= self._error:
+            return ""
+        if last.loads >= self._max_train:
+            return f"data.train.max_train = {self._max_train} reached"
+        medians = [point.median for point in self.points]
+        before, recent = medians[:-PATIENCE], medians[-PATIENCE:]
+        if before and min(recent) > MIN_GAIN * min(before):
+            return f"{PATIENCE} fits without gain: more loads no longer reduce the error"
+        # the next fit would take at least as long as the last one
+        if self._minutes is not None and last.seconds + self._fit_seconds >= 60 * self._minutes:
+            return f"data.train.minutes = {self._minutes:g} reached"
+        return ""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of loads that all training processes have taken."""
-        taken = self._first if self._replay is None else self._replay.taken
-        return {"next_index": max(self._first, taken)}
+        """Return the learning curve as plain data."""
+        return {"points": [list(point) for point in self.points]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue a stream where it was left; no load is drawn twice."""
-        self._first = state["next_index"]
+        """Continue a learning curve."""
+        self.points = [CurvePoint(int(n), *map(float, rest)) for n, *rest in state["points"]]
 
 
 def fit_sizes(train: int, val: int) -> dict[str, int]:

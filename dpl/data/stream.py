@@ -1,18 +1,109 @@
-"""Endless stream of samples that worker processes solve while a network trains."""
+"""Endless stream of training samples that worker processes solve while a network trains."""
 
 import itertools
-from collections.abc import Generator, Iterator
+import time
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, field
+from typing import Any
 
 import torch
 
+from dpl.data.samples import transform
 from dpl.data.solving.background import Background, StopFlag
 from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.solving.worker_pool import solve_loads
-from dpl.scene import Sample, Scene
+from dpl.data.sources import MAX_COUNT, Source
+from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
+from dpl.scene import Sample, Scene, stack
+from dpl.system.checks import check_range
+from dpl.system.memory import machine, refuse_beyond
+from dpl.system.threads import leave_cores
 
 AHEAD = 8  # solved loads, for each worker, that wait to be used
 MAX_EARLY = 256  # loads solved before a load of a smaller number, after which that one is left out
+
+
+@dataclass(eq=False)
+class Stream(Source):
+    """Samples that worker processes solve while the network trains, kept in a `ReplayBuffer`.
+
+    Attributes:
+        batches: Batches in an epoch.
+        new_per_round: New samples after which batches are drawn again.
+        reuse: Maximum number of uses of a sample.
+        capacity: Number of samples that the replay buffer keeps.
+    """
+
+    _: KW_ONLY
+    batches: int = 16
+    new_per_round: int = 8
+    reuse: int = 50
+    capacity: int = 4096
+    _replay: "ReplayBuffer | None" = field(default=None, init=False)
+    _first: int = field(default=0, init=False)  # number of loads of the run that this one resumes
+
+    def __post_init__(self) -> None:
+        counts = {name: getattr(self, name) for name in ("batches", "new_per_round", "reuse")}
+        check_range(1, MAX_COUNT, **counts)
+        if self.capacity < self.new_per_round:
+            raise ValueError(
+                f"capacity = {self.capacity} must be at least new_per_round = {self.new_per_round}"
+            )
+
+    def check(self, scene: Scene, batch_size: int) -> None:
+        """Check that the buffer can give a batch and fits into the memory of the machine."""
+        if self.capacity * self.reuse < batch_size:
+            raise ValueError(
+                f"capacity * reuse = {self.capacity} * {self.reuse} must be at least batch_size = "
+                f"{batch_size}; take a larger data.train.capacity or data.train.reuse"
+            )
+        needed = self.capacity * 2 * 8 * scene.problem.points.numel() / 1e9
+        remedy = "take a smaller data.train.capacity"
+        refuse_beyond(needed, machine(), f"{self.capacity} samples", remedy)
+
+    @property
+    def rates(self) -> Mapping[str, float] | None:  # type: ignore[override]
+        """Rates of the stream in the last epoch, see `ReplayBuffer`."""
+        return self._replay.rates if self._replay is not None else None
+
+    def loader(self, data: Any) -> "ReplayBuffer":
+        """Return the stream; training is limited to the cores that its workers leave."""
+        leave_cores(data.workers)
+        self.close()  # the stream of an earlier training
+        stream = SampleStream(
+            data.scene,
+            data.store.stream("train"),
+            self._first,
+            *data.rank_and_world_size,
+            workers=data.workers,
+            timeout=data.dataset.timeout,
+        )
+        self._replay = ReplayBuffer(stream, self, data.batch_size, data.shuffle_seed, data.group)
+        return self._replay
+
+    def close(self) -> None:
+        """Stop the workers."""
+        if self._replay is not None:
+            self._replay.stream.close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the number of loads that all training processes have taken.
+
+        Other processes have taken as many samples, but may have met more rejected loads. The number
+        of loads that this process has taken beyond its samples is therefore added once more.
+        """
+        taken = self._first
+        if self._replay is not None:
+            taken = max(taken, self._replay.next_index)
+            processes, workers = self._replay.stream.world_size, self._replay.stream.workers
+            if processes > 1:
+                beyond = taken - self._first - processes * self._replay.produced
+                taken += processes * max(1, workers) + max(0, beyond)
+        return {"next_index": taken}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue a stream where it was left; no load is drawn twice."""
+        self._first = state["next_index"]
 
 
 @dataclass(eq=False)
@@ -23,28 +114,25 @@ class SampleStream:
     needed. Nothing is solved before the first sample is needed.
 
     Attributes:
-        scene: Scene whose loads are solved.
+        scene, workers, timeout: See `solve_loads`.
         seed: Seed of the stream.
         first: Number of the first load.
-        rank: Index of this training process.
-        world_size: Number of training processes, which share the stream.
-        workers: Number of worker processes, one core each; 0: solve in this process.
-        timeout: Time limit for a load in a worker [s]; None: no limit.
+        rank: Index of this training process, of `world_size` processes that share the stream.
     """
 
     scene: Scene
     seed: tuple[int, int]
-    _: KW_ONLY
     first: int = 0
     rank: int = 0
     world_size: int = 1
+    _: KW_ONLY
     workers: int = 0
     timeout: float | None = None
     _solved: Background[SolvedLoad] | None = field(default=None, init=False)
 
     def __iter__(self) -> Iterator[tuple[int, Sample]]:
         """Yield numbers and samples, fields of shape (N, D)."""
-        ahead = AHEAD * self.workers
+        ahead, loads = AHEAD * self.workers, self.scene.loads
         self._solved = Background(self._solve, thread=self.workers > 0, ahead=ahead)
         early: dict[int, SolvedLoad] = {}
         for number in self._numbers():
@@ -55,7 +143,10 @@ class SampleStream:
                     early[solved.job.number] = solved
             found = early.pop(number, None)
             if found is not None and found.accepted:
-                yield number, self._sample(found)
+                point = torch.from_numpy(found.point)[None]
+                force, displacement = map(torch.from_numpy, (found.force, found.displacement))
+                young, parameters = loads.young_at(point)[0], loads.parameters_at(point)[0]
+                yield number, Sample(force, displacement, young, parameters)
 
     def _numbers(self) -> Iterator[int]:
         return itertools.count(self.first + self.rank, self.world_size)
@@ -64,12 +155,109 @@ class SampleStream:
         jobs = (LoadKey(self.seed, number) for number in self._numbers())
         return solve_loads(self.scene, jobs, workers=self.workers, timeout=self.timeout, stop=stop)
 
-    def _sample(self, solved: SolvedLoad) -> Sample:
-        loads, point = self.scene.loads, torch.from_numpy(solved.point)[None]
-        force, displacement = map(torch.from_numpy, (solved.force, solved.displacement))
-        return Sample(force, displacement, loads.young_at(point)[0], loads.parameters_at(point)[0])
-
     def close(self) -> None:
         """Finish the solves in progress and end the workers."""
         if self._solved is not None:
             self._solved.close()
+
+
+class ReplayBuffer:
+    """Batches from the last samples of a stream, each used a bounded number of times.
+
+    In each round, `new_per_round` new samples enter a buffer, where they replace the oldest ones
+    once it is full. Batches are then drawn from the samples that have been used less than `reuse`
+    times. Once the buffer is full, a sample is used `reuse` times on average; while it fills, half
+    as often. Batches are therefore a function of the stream and not of relative speeds. One pass
+    is an epoch; the stream continues from epoch to epoch.
+
+    Attributes:
+        stream: Source of the samples.
+        produced: Number of samples taken from the stream so far.
+        next_index: Upper bound of the numbers of these loads, plus one.
+        rates: `produced` samples per second of the last epoch, fraction of its time `waiting` for
+            samples, mean number of `uses` of a sample so far, samples in the `buffer`; None before
+            its end.
+    """
+
+    def __init__(
+        self,
+        stream: SampleStream,
+        sizes: Stream,
+        batch_size: int,
+        seed: int = 0,
+        group: SymmetryGroup = NO_SYMMETRIES,
+    ) -> None:
+        """Start with an empty buffer.
+
+        Args:
+            stream: Source of the samples.
+            sizes: Sizes of the buffer, of its rounds and of an epoch.
+            batch_size: Samples in a batch.
+            seed: Seed of the choice of samples and images.
+            group: Symmetries of the body, identity first: each use is that of a random image.
+        """
+        self.stream, self.batch_size, self.group = stream, batch_size, group
+        self.produced = self.next_index = 0
+        self.rates: dict[str, float] | None = None
+        self._sizes = sizes
+        self._samples: list[Sample] = []
+        self._uses_left = torch.zeros(sizes.capacity, dtype=torch.int64)
+        self._batches = self._draw()
+        self._generator = torch.Generator().manual_seed(seed)
+        self._used = 0
+        self._waited = 0.0
+
+    def __len__(self) -> int:
+        """Return the number of batches in an epoch."""
+        return self._sizes.batches
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Yield the batches of one epoch."""
+        start, produced, waited = time.monotonic(), self.produced, self._waited
+        for k, batch in enumerate(itertools.islice(self._batches, len(self)), 1):
+            if k == len(self):  # before the last batch, after which no code of this loop runs
+                seconds = max(time.monotonic() - start, 1e-9)
+                self.rates = {
+                    "produced": (self.produced - produced) / seconds,
+                    "waiting": (self._waited - waited) / seconds,
+                    "uses": self._used / max(self.produced, 1),
+                    "buffer": float(len(self._samples)),
+                }
+            yield batch
+
+    def _draw(self) -> Iterator[Sample]:
+        """Yield batches without end."""
+        samples, sizes = iter(self.stream), self._sizes
+        budget = 0.0  # uses that the samples so far allow
+        while True:
+            start = time.monotonic()
+            new = list(itertools.islice(samples, sizes.new_per_round))
+            self._waited += time.monotonic() - start
+            if not new:  # the end of a finite stream
+                return
+            self.produced += len(new)
+            self.next_index = new[-1][0] + 1
+            is_full = len(self._samples) == sizes.capacity
+            budget += len(new) * (sizes.reuse if is_full else max(1.0, sizes.reuse / 2))
+            for number, (_, sample) in enumerate(new, self.produced - len(new)):
+                place = number % sizes.capacity
+                self._samples[place : place + 1] = [sample]  # appends while the buffer fills
+                self._uses_left[place] = sizes.reuse
+            while budget >= self.batch_size and self._uses_left.sum() >= self.batch_size:
+                budget -= self.batch_size
+                self._used += self.batch_size
+                batch = stack([self._samples[place] for place in self._choose()])
+                if self.group:
+                    shape = (self.batch_size,)
+                    which = torch.randint(len(self.group), shape, generator=self._generator)
+                    batch = transform(batch, self.group, which)
+                yield batch
+
+    def _choose(self) -> list[int]:
+        """Return the places of samples for a batch, distinct if there are enough."""
+        usable = self._uses_left.nonzero()[:, 0]
+        if len(usable) < self.batch_size:
+            usable = torch.repeat_interleave(usable, self._uses_left[usable])
+        chosen = usable[torch.randperm(len(usable), generator=self._generator)[: self.batch_size]]
+        self._uses_left -= torch.bincount(chosen, minlength=len(self._uses_left))
+        return list(chosen.tolist())

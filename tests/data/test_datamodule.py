@@ -10,19 +10,10 @@ import torch
 
 from dpl import Sample
 from dpl.data import DataModule, Stream
-from dpl.data.solving.solve import solve_load
 from dpl.fem import symmetries
 
 SIZES = {"val": 4, "test": 4, "workers": 0, "batch_size": 4}
 STREAM = {"batches": 3, "new_per_round": 4, "reuse": 1, "capacity": 64}
-
-
-@pytest.fixture(autouse=True)
-def threads():
-    """Restore the number of threads, which a stream changes."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture
@@ -153,11 +144,10 @@ def test_images_keep_the_modulus_of_their_sample(make_scene, folder, data):
         assert torch.equal(batch.young, samples.young[found])
 
 
-@pytest.mark.parametrize("symmetry", [False, True])
-def test_validation_and_test_keep_their_order_and_have_no_images(offline, symmetry):
-    module = offline(symmetry=symmetry, batch_size=3)
-    assert forces(module.val_dataloader()) == forces([module.samples("val")])
-    assert forces(module.test_dataloader()) == forces([module.samples("test")])
+def test_validation_and_test_keep_their_order_and_have_no_images(offline, online):
+    for module in (offline(symmetry=True, batch_size=3), offline(), online()):
+        assert forces(module.val_dataloader()) == forces([offline().samples("val")])
+        assert forces(module.test_dataloader()) == forces([offline().samples("test")])
 
 
 def test_a_force_in_every_load_breaks_the_symmetries_that_turn_it(make_scene, tmp_path):
@@ -237,22 +227,10 @@ def test_the_stream_solves_the_loads_that_the_data_set_would_hold(online, offlin
     assert set(forces(batches)) == set(forces([offline().samples("train")]))
 
 
-def test_the_stream_validates_on_the_data_set(online, offline):
-    assert forces(online().val_dataloader()) == forces(offline().val_dataloader())
-    assert forces(online().test_dataloader()) == forces(offline().test_dataloader())
-
-
-def test_a_stream_writes_no_training_load(online, tmp_path, monkeypatch):
-    seen = []
-
-    def counted(scene, job, guess=None):
-        seen.append(job.seed)
-        return solve_load(scene, job)
-
-    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", counted)
+def test_a_stream_writes_no_training_load(online, tmp_path, solved):
     module = online(path=tmp_path / "d", val=2, test=3)
     module.prepare_data()
-    assert sorted(seen) == [(0, 1)] * 2 + [(0, 2)] * 3
+    assert sorted(solved) == [(1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
     before = sorted((tmp_path / "d").rglob("*"))
     list(module.train_dataloader())
     assert sorted((tmp_path / "d").rglob("*")) == before
@@ -274,11 +252,8 @@ def test_a_resumed_stream_continues_with_the_next_load(online):
     assert resumed.state_dict() == {"next_index": 24}
 
 
-def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, monkeypatch):
-    def choosy(scene, job, guess=None):
-        return solve_load(scene, job)._replace(accepted=job.number % 3 == 1)
-
-    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", choosy)
+def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, solves):
+    solves(lambda one: one._replace(accepted=one.job.number % 3 == 1))
     module = online()
     first = set(forces(module.train_dataloader()))
     resumed = online()
@@ -286,22 +261,18 @@ def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, mo
     assert not first & set(forces(resumed.train_dataloader()))
 
 
-def test_rejected_loads_with_nan_do_not_reach_training(online, monkeypatch):
-    def choosy(scene, job, guess=None):
-        one = solve_load(scene, job)
+def test_rejected_loads_with_nan_do_not_reach_training(online, solves):
+    def change(one):
         bad = one._replace(accepted=False, reason="x", displacement=np.nan * one.displacement)
-        return bad if job.number % 2 else one
+        return bad if one.job.number % 2 else one
 
-    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", choosy)
+    solves(change)
     for batch in online().train_dataloader():
         assert all(torch.isfinite(column).all() for column in batch)
 
 
 def test_a_stream_does_not_raise_the_number_of_threads(online):
     """A limit such as OMP_NUM_THREADS=1 is kept."""
-    before = torch.get_num_threads()
     torch.set_num_threads(1)
     online().train_dataloader()
-    after = torch.get_num_threads()
-    torch.set_num_threads(before)
-    assert after == 1
+    assert torch.get_num_threads() == 1

@@ -8,8 +8,7 @@ import pytest
 from set_files import content
 
 from dpl.data import DataSet, Store
-from dpl.data.solving.solve import failed_load, solve_load
-from dpl.fem import SaintVenantKirchhoff
+from dpl.data.solving.solve import failed_load
 
 SIZES = {"train": 6, "val": 2, "test": 2}
 
@@ -22,19 +21,6 @@ def wanted(scene, tmp_path):
         return DataSet(scene, str(tmp_path / "d"), **{**SIZES, "workers": 0, **other})
 
     return wanted
-
-
-@pytest.fixture
-def solved(monkeypatch):
-    """The list of solved loads, extended by each solve."""
-    found = []
-
-    def counted(scene, job, guess=None):
-        found.append((job.seed[1], job.number))
-        return solve_load(scene, job)
-
-    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", counted)
-    return found
 
 
 @pytest.fixture
@@ -89,14 +75,6 @@ def test_the_plan_counts_existing_loads_and_writes_nothing(wanted, scene, tmp_pa
 # ------------------------------------------------------------------ filling it
 
 
-def test_progress_shows_accepted_rejected_and_samples_a_second(wanted, capsys):
-    wanted().fill()
-    out = capsys.readouterr().out
-    assert "10/10" in out
-    assert "10 accepted, 0 rejected" in out
-    assert "/s" in out
-
-
 def test_the_journal_has_a_line_for_each_session_that_solved_something(wanted, capsys):
     store = wanted(val=0, test=0).fill()
     wanted(val=0, test=0).fill()
@@ -111,8 +89,12 @@ def test_the_journal_has_a_line_for_each_session_that_solved_something(wanted, c
         assert {"started", "machine", "python", "dpl"} <= set(one)
 
 
-def test_the_summary_tells_splits_amplitudes_and_time(wanted):
+def test_progress_and_summary_tell_splits_amplitudes_and_time(wanted, capsys):
     reported = wanted().fill().summary().splitlines()
+    out = capsys.readouterr().out
+    assert "10/10" in out
+    assert "10 accepted, 0 rejected" in out
+    assert "/s" in out
     assert reported[0].endswith("/d")
     assert "train: 6 of 6 loads accepted" in reported[1]
     assert "val: 2 of 2 loads accepted" in reported[2]
@@ -161,22 +143,15 @@ def test_a_set_interrupted_by_two_signals_has_the_bytes_of_an_uninterrupted_one(
 # ------------------------------------------------------------------ warnings
 
 
-def test_an_unbiased_set_and_six_rejected_loads_give_no_warning(
-    wanted, make_scene, tmp_path, capsys
-):
+def test_an_unbiased_set_and_six_rejected_loads_give_no_warning(wanted, hard, tmp_path, capsys):
     wanted(train=20).fill()
     assert capsys.readouterr().err == ""
-    hard = make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch_radius=(2.0, 2.0))
     DataSet(hard, str(tmp_path / "hard"), train=6, val=0, test=0, workers=0).fill()
     assert "biased" not in capsys.readouterr().err, "six loads say nothing"
 
 
-def test_a_biased_set_gives_a_warning_of_one_line(wanted, monkeypatch, capsys):
-    def picky(scene, job, guess=None):
-        one = solve_load(scene, job)
-        return failed_load(scene, job, "not converged") if one.amplitude > 0.1 else one
-
-    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", picky)
+def test_a_biased_set_gives_a_warning_of_one_line(scene, wanted, solves, capsys):
+    solves(lambda one: failed_load(scene, one.job, "no") if one.amplitude > 0.1 else one)
     store = wanted(train=80).fill()
     err = capsys.readouterr().err
     poor = [part for part in store.acceptance() if part.biased]
@@ -215,25 +190,22 @@ def test_the_command_verifies_and_repairs_a_set(script, tiny, tmp_path):
     assert script("generate", *sizes, "action=verify", cwd=tmp_path).status == 0
 
 
-@pytest.mark.parametrize(
-    ("override", "reported"),
-    [
-        ("action=look", "action = 'look' must be one of generate, verify, repair"),
-        ("shard=1", "shard = 1"),
-        ("data.timeout=0", "timeout = 0"),
-        ("data.seed=1", "was drawn with seed 0, not 1"),
-        ("material.poisson=0.31", "another scene"),
-        (["data.folder=typo", "action=verify"], "typo holds no data set yet; generate it first"),
-    ],
-)
-def test_invalid_options_end_with_one_line_and_status_2(
-    script, tiny, scene_of, wanted, tmp_path, override, reported
-):
+INVALID = {
+    "action=look": "action = 'look' must be one of generate, verify, repair",
+    "shard=1": "shard = 1",
+    "data.timeout=0": "timeout = 0",
+    "data.seed=1": "was drawn with seed 0, not 1",
+    "material.poisson=0.31": "another scene",
+    "data.folder=typo action=verify": "typo holds no data set yet; generate it first",
+}
+
+
+def test_invalid_options_end_with_one_line_and_status_2(script, tiny, scene_of, tmp_path):
     scene = scene_of(*tiny)
     DataSet(scene, str(tmp_path / "d"), train=1, val=0, test=0, workers=0).fill()
-    override = [override] if isinstance(override, str) else override
-    ended = script("generate", *tiny, "data.folder=d", *override, cwd=tmp_path)
-    assert ended.status == 2
-    assert ended.err.startswith("error: ")
-    assert reported in ended.err
-    assert ended.err.count("\n") == 1
+    for override, reported in INVALID.items():
+        ended = script("generate", *tiny, "data.folder=d", *override.split(), cwd=tmp_path)
+        assert ended.status == 2, override
+        assert ended.err.startswith("error: ")
+        assert reported in ended.err
+        assert ended.err.count("\n") == 1

@@ -78,21 +78,15 @@ def test_verify_finds_a_displacement_with_det_F_of_zero(copy, monkeypatch):
     assert flaws(copy)[FIRST] == "holds a displacement that is not in equilibrium: load 0"
 
 
-@pytest.mark.parametrize(
-    ("lost", "reported"),
-    [
-        (
-            {"train": 13},
-            ["lacks 1 of the loads that data.train = 13 requires; the first is load 12"],
-        ),
-        ({"train": 14, "test": 5}, ["data.train = 14", "data.test = 5"]),
-        ({"train": 3, "val": 0}, []),
-    ],
-)
-def test_verify_finds_missing_loads(copy, lost, reported):
-    found = list(wanted(copy, **lost).verify())
-    assert len(found) == len(reported)
-    assert all(words in line for words, line in zip(reported, found, strict=True))
+LACKS = "lacks 1 of the loads that data.train = 13 requires; the first is load 12"
+
+
+def test_verify_finds_missing_loads(copy):
+    assert list(wanted(copy, train=3, val=0).verify()) == []
+    assert list(wanted(copy, train=13).verify()) == [f"{copy.folder} {LACKS}"]
+    train, test = wanted(copy, train=14, test=5).verify()
+    assert "data.train = 14" in train
+    assert "data.test = 5" in test
 
 
 def test_verify_of_a_part_ignores_the_loads_of_other_parts(copy, monkeypatch):

@@ -1,7 +1,6 @@
 """A data set that is solved, killed, damaged and repaired in any order has the bytes of one run."""
 
 import functools
-import hashlib
 import shutil
 from collections import Counter
 from contextlib import contextmanager, suppress
@@ -12,6 +11,7 @@ import torch
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
+from set_files import content
 
 from dpl.data import DataSet, DataSetError, Store, dataset
 from dpl.data.solving.solve import failed_load, solve_load
@@ -45,11 +45,6 @@ def killed_after(operations):
         patch.setattr("dpl.system.files.os.replace", dying(shutil.move))
         patch.setattr(Path, "unlink", dying(Path.unlink))
         yield
-
-
-def files(folder):
-    """Return the SHA-256 of the shards and the modes."""
-    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.glob("*.saf*")}
 
 
 class Life(RuleBasedStateMachine):
@@ -124,20 +119,20 @@ class Life(RuleBasedStateMachine):
             return
         self.is_sound, self.lost_work = False, True
         path = found[which % len(found)]
-        content = bytearray(path.read_bytes())
-        place = int(place * len(content))
-        if how == "flip" and content:
-            content[place] ^= 1 << which % 8
+        harmed = bytearray(path.read_bytes())
+        place = int(place * len(harmed))
+        if how == "flip" and harmed:
+            harmed[place] ^= 1 << which % 8
         elif how in ("cut", "empty"):
-            del content[place if how == "cut" else 0 :]
+            del harmed[place if how == "cut" else 0 :]
         if how == "stray":
-            (self.folder / f"train-{which:06d}00.safetensors").write_bytes(content)
+            (self.folder / f"train-{which:06d}00.safetensors").write_bytes(harmed)
         elif how == "part":
-            path.with_name(f".{path.name}.99.part").write_bytes(content)
+            path.with_name(f".{path.name}.99.part").write_bytes(harmed)
         elif how == "delete":
             path.unlink()
         else:
-            path.write_bytes(content)
+            path.write_bytes(harmed)
 
     @rule()
     def it_is_repaired(self):
@@ -157,7 +152,7 @@ class Life(RuleBasedStateMachine):
                     assert torch.equal(truth.displacement[int(row)], displacement)
 
     def is_complete(self):
-        assert files(self.folder) == files(self.whole.folder)
+        assert content(self.folder) == content(self.whole.folder)
         assert list(self.writer().verify()) == []
         assert not list(self.folder.rglob("*.part"))
 

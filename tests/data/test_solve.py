@@ -7,30 +7,18 @@ import sys
 import numpy as np
 import pytest
 import torch
+from set_files import fields_of as content
 
 from dpl.data.solving import solve
 from dpl.data.solving.solve import LoadKey, failed_load, solve_load
-from dpl.fem import Load, Newton, SaintVenantKirchhoff
+from dpl.fem import Load, Newton
 
 SEED = (5, 0)
-CLOCK = "seconds"
-
-
-def content(one):
-    """Return all of an outcome that may not depend on a clock, as comparable values."""
-    fields = {name: value for name, value in one._asdict().items() if name != CLOCK}
-    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in fields.items()}
 
 
 @pytest.fixture(scope="module")
 def jobs():
     return [LoadKey(SEED, index) for index in range(8)]
-
-
-@pytest.fixture(scope="module")
-def hard(make_scene):
-    """Loads of ten times L on a law that does not bear them all."""
-    return make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch_radius=(2.0, 2.0))
 
 
 def test_a_solution_does_not_depend_on_the_loads_solved_before(scene, jobs):

@@ -1,17 +1,18 @@
 """Laws of the worker pool: samples do not depend on workers; faults are recorded."""
 
+import ctypes
 import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import pytest
+from set_files import fields_of as content
 
 from dpl import Scene
 from dpl.data.solving import worker_pool
@@ -20,62 +21,39 @@ from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
 from dpl.fem import ModalLoads
 
 SEED = (5, 0)
-CLOCK = "seconds"
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True, eq=False)
 class Fragile(ModalLoads):
-    """Loads of which one damages the worker that draws it.
+    """Loads of which some damage the worker that draws them.
 
     Attributes:
-        victim: Number of that load; -1: every one.
-        harm: die, hang, raise, or die once: if the file `mark` is not there yet.
-        mark: See `harm`.
+        harms: What they do, by number: die, hang, raise, or a file that they make to die once.
     """
 
-    victim: int = -1
-    harm: str = "die"
-    mark: str = ""
+    harms: dict = field(default_factory=dict)
 
     def points(self, seed, indices):
-        mine = self.victim in (-1, *indices)
-        if mine and multiprocessing.parent_process() is not None:
-            if self.harm == "hang":
-                sum(range(10**12))  # one call in C: no signal handler, no other thread
-            elif self.harm == "raise":
+        harm = self.harms.get(indices[0])
+        if harm and multiprocessing.parent_process() is not None:
+            if harm == "hang":  # one call in C: no signal handler, no other thread
+                ctypes.PyDLL(None).sleep(10**6)
+            elif harm == "raise":
                 raise RuntimeError("no load can be drawn")
-            elif self.harm == "die":
+            elif harm == "die":
                 os._exit(1)
-            elif not Path(self.mark).exists():
-                Path(self.mark).touch()
+            elif not Path(harm).exists():
+                Path(harm).touch()
                 os.kill(os.getpid(), signal.SIGKILL)
         return super().points(seed, indices)
 
 
-class Asked(GracefulShutdown):
-    """Is true after a number of evaluations."""
-
-    def __init__(self, looks):
-        super().__init__()
-        self.looks = looks
-
-    def __bool__(self):
-        self.looks -= 1
-        return self.looks < 0
-
-
-def fragile(scene, **how):
+def fragile(scene, harms):
     linear, modes = scene.solver.linear_solver, scene.loads.eigenmodes
-    loads = Fragile(linear, n_modes=3, young=4500.0, **how)
+    loads = Fragile(linear, n_modes=3, young=4500.0, harms=harms)
     loads.__dict__["eigenmodes"] = modes
     return Scene(scene.problem, loads, scene.solver)
-
-
-def content(one):
-    """Return the fields of a solved load that must not depend on its process."""
-    fields = {name: value for name, value in one._asdict().items() if name != CLOCK}
-    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in fields.items()}
 
 
 def by_index(found):
@@ -119,16 +97,22 @@ def test_no_jobs_cost_no_process(scene, monkeypatch):
     assert list(solve_loads(scene, [], workers=2)) == []
 
 
-def test_a_killed_worker_is_replaced_and_the_bytes_do_not_depend_on_workers(
-    scene, jobs, here, tmp_path
+def test_workers_that_are_killed_or_hang_are_replaced_and_the_bytes_do_not_depend_on_workers(
+    scene, here, monkeypatch, tmp_path
 ):
+    """The additional time for the first load of a worker is granted once."""
+    monkeypatch.setattr(worker_pool, "STARTUP_GRACE", 1e6)
     mark = tmp_path / "killed"
-    found = list(
-        solve_loads(fragile(scene, victim=2, harm="die once", mark=str(mark)), jobs, workers=1)
-    )
+    harmful = fragile(scene, {2: str(mark), 1: "hang"})
+    solving = solve_loads(harmful, _jobs(2, 0, 1), workers=1, timeout=0.5)
+    found = {one.job.number: one for one in solving}
     assert mark.exists()
-    assert sorted(one.job.number for one in found) == list(range(8))
-    assert by_index(found) == here
+    late = found.pop(1)
+    assert by_index(found.values()) == {number: here[number] for number in (0, 2)}
+    assert late.reason == "timed out after 0.5 s"
+    assert late.seconds == 0.5
+    assert not late.accepted
+    assert late.force.tobytes() == here[1]["force"]
 
 
 def test_a_pool_has_no_more_workers_than_loads_and_leaves_none_when_closed(scene, jobs, here):
@@ -137,6 +121,8 @@ def test_a_pool_has_no_more_workers_than_loads_and_leaves_none_when_closed(scene
     first = next(running)
     members = children() - before
     assert len(members) == 1
+    (command,) = [Path(f"/proc/{pid}/cmdline").read_text() for pid in members]
+    assert "die_with_parent" in command
     running.close()
     assert content(first) == here[first.job.number]
     assert not any(Path(f"/proc/{pid}").exists() for pid in members)
@@ -148,29 +134,11 @@ def test_a_pool_has_no_more_workers_than_loads_and_leaves_none_when_closed(scene
 @pytest.mark.parametrize("tries", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_load_that_kills_every_worker_is_given_up_with_a_reason(scene, here, monkeypatch, tries):
     monkeypatch.setattr(worker_pool, "MAX_RETRIES", tries)
-    victim = fragile(scene, victim=1)
-    found = {one.job.number: one for one in solve_loads(victim, _jobs(1, 0), workers=1)}
-    assert content(found[0]) == here[0]
-    one = found[1]
+    (one,) = solve_loads(fragile(scene, {1: "die"}), _jobs(1), workers=1)
     assert one.reason == f"its worker died {tries} times"
     assert not one.accepted
     assert one.load_factor == 0
     assert one.force.tobytes() == here[1]["force"], "the load that could not be solved is kept"
-
-
-def test_a_load_that_hangs_is_recorded_and_the_others_are_solved(scene, here, monkeypatch):
-    """The additional time for the first load of a worker is granted once."""
-    monkeypatch.setattr(worker_pool, "STARTUP_GRACE", 1e6)
-    victim = fragile(scene, victim=1, harm="hang")
-    found = {
-        one.job.number: one for one in solve_loads(victim, _jobs(0, 1, 2), workers=1, timeout=0.5)
-    }
-    assert [content(found[k]) for k in (0, 2)] == [here[0], here[2]]
-    one = found[1]
-    assert one.reason == "timed out after 0.5 s"
-    assert one.seconds == 0.5
-    assert not one.accepted
-    assert one.force.tobytes() == here[1]["force"]
 
 
 def test_workers_that_exceed_the_time_limit_while_starting_are_replaced(scene, monkeypatch):
@@ -181,9 +149,9 @@ def test_workers_that_exceed_the_time_limit_while_starting_are_replaced(scene, m
 
 def test_workers_that_all_die_end_the_run(scene, monkeypatch, capfd):
     monkeypatch.setattr(worker_pool, "MAX_CONSECUTIVE_CRASHES", 1)
-    victim = fragile(scene, harm="raise")
+    victim = fragile(scene, {0: "raise"})
     with pytest.raises(RuntimeError, match="1 workers died in a row"):
-        list(solve_loads(victim, _jobs(0, 1), workers=1))
+        list(solve_loads(victim, _jobs(0), workers=1))
     assert "no load can be drawn" in capfd.readouterr().err
 
 
@@ -205,14 +173,9 @@ def test_exit_raises_after_one_signal(capfd):
     assert "again to abort" in capfd.readouterr().err
 
 
+@pytest.mark.parametrize("second", SIGNALS)
 @pytest.mark.parametrize(
-    ("first", "second", "raised"),
-    [
-        (signal.SIGINT, signal.SIGINT, KeyboardInterrupt),
-        (signal.SIGTERM, signal.SIGTERM, SystemExit),
-        (signal.SIGINT, signal.SIGTERM, KeyboardInterrupt),
-        (signal.SIGTERM, signal.SIGINT, SystemExit),
-    ],
+    ("first", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
 )
 def test_a_second_signal_raises_at_once(first, second, raised):
     with GracefulShutdown() as stop:
@@ -233,17 +196,13 @@ def test_signal_handlers_are_restored_after_an_error():
 
 
 def test_another_thread_leaves_signal_handlers_unchanged():
-    found = []
-
     def enter():
         before = signal.getsignal(signal.SIGINT)
         with GracefulShutdown() as stop:
-            found.append((signal.getsignal(signal.SIGINT) is before, bool(stop)))
+            return signal.getsignal(signal.SIGINT) is before, bool(stop)
 
-    thread = threading.Thread(target=enter)
-    thread.start()
-    thread.join()
-    assert found == [(True, False)]
+    with ThreadPoolExecutor() as threads:
+        assert threads.submit(enter).result() == (True, False)
 
 
 def test_after_a_signal_no_load_is_started_in_this_process(scene, jobs, here):
@@ -265,11 +224,8 @@ def test_after_a_signal_only_the_solves_in_progress_are_finished(scene, jobs, he
     assert by_index(found) == {number: here[number] for number in by_index(found)}
 
 
-@pytest.mark.parametrize("looks", [0, 2])
-def test_a_stop_is_checked_before_each_load_is_sent_to_a_worker(scene, jobs, looks):
-    running = solve_loads(scene, jobs[:2], workers=1, stop=Asked(looks), timeout=60.0)
-    found = [one.job.number for one in running]
-    assert found == list(range(looks))
+def test_a_stop_is_checked_before_the_first_load_is_sent_to_a_worker(scene, jobs):
+    assert list(solve_loads(scene, jobs, workers=1, stop=True)) == []
 
 
 # ------------------------------------------------------------------ the end of the program

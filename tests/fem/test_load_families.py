@@ -399,9 +399,7 @@ def test_coefficients_that_no_fit_tells_apart_are_in_range_if_some_are(linear):
     both = [[[0.0, 0.0, 0.0], [80.0, 0.0, 0.0]]]  # the sum of these
     cables = fem.CableLoads(linear, [*same, *both], tension=[1.0, 2.0])
     assert placed(cables, torch.stack([cables.force_at(one) for one in np.eye(3)])) == {"in"}
-    nodes = fem.ModalLoads(
-        linear, n_modes=5, patch_radius=(0.0, 0.0)
-    )  # fewer components than modes
+    nodes = fem.ModalLoads(linear, n_modes=5, patch_radius=(0.0, 0.0))  # 3 components, 5 modes
     assert placed(nodes, nodes.sample(0, range(200)).force) == {"in"}
 
 
@@ -436,6 +434,10 @@ def test_a_fixed_region_is_refused_in_one_line(build, linear, name):
         (fixed.loadable_dofs, fixed.largest_force)  # noqa: B018
 
 
+NEGATIVE = partial(fem.PatchLoads, largest=-1.0)
+NOWHERE = partial(fem.PatchLoads, region=fem.Plane(0, 7.0))
+
+
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
@@ -458,15 +460,11 @@ def test_a_fixed_region_is_refused_in_one_line(build, linear, name):
         ("mixture", {"families": {}}, "families must contain one with a weight above 0"),
         ("mixture", {"weights": {"patch": -1.0}}, "weights.patch = -1.0 must be a number from 0"),
         ("mixture", {"weights": {"patches": 1.0}}, "weights.patches: there is no such family"),
+        ("mixture", {"families": {"b": NEGATIVE}}, "families.b: largest = -1.0 must"),
         (
             "mixture",
-            {"families": {"b": partial(fem.PatchLoads, largest=-1.0)}},
-            "families.b: largest = -1.0 must",
-        ),
-        (
-            "mixture",
-            {"families": {"b": partial(fem.PatchLoads, region=fem.Plane(0, 7.0))}},
-            "families.b: region = Plane(axis=0, at=7.0) holds no facet",
+            {"families": {"b": NOWHERE}},
+            "families.b: region = Plane(axis=0, at=7.0) holds",
         ),
         ("patch", {"region": fem.Plane(0, 7.0)}, "region = Plane(axis=0, at=7.0) holds no facet"),
         ("point", {"count": (1, 60)}, "count = [1, 60] must be at most 41"),
@@ -530,11 +528,8 @@ def test_files_that_cannot_be_used_are_refused_in_one_line(linear, tmp_path):
 
 
 def test_a_mixture_draws_its_families_by_weight_and_names_them(linear):
-    families = {
-        "modal": partial(fem.ModalLoads, n_modes=3),
-        "point": fem.PointLoads,
-        "none": fem.GravityLoads,
-    }
+    modal = partial(fem.ModalLoads, n_modes=3)
+    families = {"modal": modal, "point": fem.PointLoads, "none": fem.GravityLoads}
     loads = fem.MixtureLoads(linear, families, {"modal": 3.0, "none": 0.0})
     assert loads.names == ("modal", "point", "none")
     points = loads.points(0, range(4000))
@@ -555,13 +550,11 @@ def test_a_mixture_draws_its_families_by_weight_and_names_them(linear):
 
 def test_mixtures_share_young_and_parameters_of_the_law():
     mesh = fem.box([4.0, 1.0, 1.0], [5, 3, 3])
-    problem = fem.Problem.build(
-        mesh, fem.NeoHookeanLn([0.2, 0.4]), fixed=fem.Plane(0, "min"), young=None
-    )
+    law = fem.NeoHookeanLn([0.2, 0.4])
+    problem = fem.Problem.build(mesh, law, fixed=fem.Plane(0, "min"), young=None)
     linear = fem.LinearSolver(problem, linear="superlu")
-    loads = fem.MixtureLoads(
-        linear, {"patch": fem.PatchLoads, "point": fem.PointLoads}, young=[1e3, 1e5]
-    )
+    families = {"patch": fem.PatchLoads, "point": fem.PointLoads}
+    loads = fem.MixtureLoads(linear, families, young=[1e3, 1e5])
     load = loads.sample(0, range(50))
     assert float(load.young.min()) < 2e4 < 8e4 < float(load.young.max())
     assert float(load.parameters.min()) < 0.25 < 0.35 < float(load.parameters.max())

@@ -43,6 +43,7 @@ def mixed(x, part=0.25, low=1e-3):
     return part * stats.loguniform(low, 1).cdf(x)
 
 
+LONG = {"part": 0.6, "low": 1e-5}
 LAWS = {  # quantiles, cumulative distribution, smallest, largest
     "uniform": (symmetric_uniform, stats.uniform(-1, 2).cdf, -1, 1),
     "normal": (normal, stats.norm(0, 1 / 3).cdf, -1, 1),
@@ -50,12 +51,7 @@ LAWS = {  # quantiles, cumulative distribution, smallest, largest
     "logarithmic": (logarithmic, stats.loguniform(1e-2, 1).cdf, 1e-2, 1),
     "four decades": (partial(logarithmic, low=1e-4), stats.loguniform(1e-4, 1).cdf, 1e-4, 1),
     "tail": (log_tail_mixture, mixed, 1e-3, 1),
-    "long tail": (
-        partial(log_tail_mixture, part=0.6, low=1e-5),
-        partial(mixed, part=0.6, low=1e-5),
-        1e-5,
-        1,
-    ),
+    "long tail": (partial(log_tail_mixture, **LONG), partial(mixed, **LONG), 1e-5, 1),
 }
 
 
@@ -118,11 +114,7 @@ def test_points_are_functions_of_seed_and_index(drawn):
 
 @pytest.mark.parametrize(
     ("name", "index"),
-    [
-        ("independent", 0),
-        ("sobol", 1),
-        ("sobol", 0),
-    ],
+    [("independent", 0), ("sobol", 1), ("sobol", 0)],
 )
 def test_a_point_can_be_changed_without_changing_the_stream(name, index):
     point = SAMPLINGS[name](11, index, 3)

@@ -20,7 +20,6 @@ def small(monkeypatch):
     """Fits begin with eight loads; the number of threads, which growth changes, is restored."""
     for module in (sources, store_module):
         monkeypatch.setattr(module, "SHARD_SIZE", 8)
-    monkeypatch.setattr("dpl.data.growing.SHARD_SIZE", 8)
     monkeypatch.setattr(sources, "MIN_REST", 8)
     before = torch.get_num_threads()
     yield

@@ -29,12 +29,10 @@ class Background(Generic[T]):
     def __init__(
         self, start: Callable[[StopFlag], Generator[T, None, None]], *, thread: bool, ahead: int = 0
     ) -> None:
-        """Start the thread.
+        """Start the thread, if there is one.
 
-        Args:
-            start: Function that returns the generator, which ends soon after its argument is true.
-            thread: Use a thread.
-            ahead: Number of items that wait for `get`; 0: no limit.
+        `start` returns the generator, which ends soon after its argument is true. At most `ahead`
+        items wait for `get`; 0: no limit.
         """
         self.ended, self._stop = False, StopFlag()
         self._items = start(self._stop)

@@ -21,12 +21,7 @@ MIN_RITZ_VALUE = 0.1
 
 
 class LoadKey(NamedTuple):
-    """Identifier of a load.
-
-    Attributes:
-        seed: Seed of the stream.
-        number: Number of the load in the stream.
-    """
+    """Identifier of a load: seed of the stream, and number of the load in the stream."""
 
     seed: tuple[int, int]
     number: int
@@ -98,11 +93,9 @@ def guessed(scene: Scene, job: LoadKey, guess: Guess | None) -> NDArray[np.float
 
 
 def _solve_near(scene: Scene, load: Load, guess: Tensor) -> Solution | None:
-    """Return the stable equilibrium near a guess (N, D), found without a factorisation, or None.
-
-    The solver of the scene decides on a load whose iteration does not converge and on one whose
-    equilibrium is unstable or nearly so. Data sets therefore hold the loads that it accepts.
-    """
+    """Return the stable equilibrium near a guess (N, D), found without a factorisation, or None."""
+    # The solver of the scene decides on a load whose iteration does not converge and on one whose
+    # equilibrium is unstable or nearly so. Data sets therefore hold the loads that it accepts.
     newton = scene.newton
     *_, solution = AndersonSolver(newton).iterate(load, guess=guess[None])
     if not solution.converged:

@@ -25,14 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpl.data.solving.solve import (
-    Guess,
-    LoadKey,
-    SolvedLoad,
-    failed_load,
-    guessed,
-    solve_load,
-)
+from dpl.data.solving.solve import Guess, LoadKey, SolvedLoad, failed_load, guessed, solve_load
 from dpl.scene import Scene
 from dpl.system.processes import block_signals, spawn_context
 
@@ -103,8 +96,7 @@ def solve_loads(
         workers: Number of processes, one core each; 0: solve in this process, without time limit.
         timeout: Time limit for a load [s]; the first load of a worker has more. None: no limit.
         stop: Once its truth value is True, no further load is started.
-        guess: Function of a load that returns a displacement near its solution; called in this
-            process when the solve starts. Only for a scene that is solved by Newton's method.
+        guess: Called in this process when a solve starts; only for the solver `newton`.
 
     Raises:
         RuntimeError: Workers die repeatedly.
@@ -143,12 +135,7 @@ def solve_loads(
 
 
 class _Worker:
-    """A worker process.
-
-    Attributes:
-        job: Load that it solves; None: it is idle.
-        deadline: Time at which the load counts as timed out [s].
-    """
+    """A worker process; its `job` is the load that it solves until `deadline` [s], None if idle."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene

@@ -11,12 +11,7 @@ MIN_LOADS = 10  # tried loads below which a bin is not judged
 
 
 class AmplitudeBin(NamedTuple):
-    """Numbers of loads in a range of amplitudes.
-
-    Attributes:
-        low, high: Limits of ||f|| / ||Phi q_max|| [-].
-        tried, accepted: Numbers of loads.
-    """
+    """Numbers of loads in a range of amplitudes ||f|| / ||Phi q_max|| [-]."""
 
     low: float
     high: float

@@ -20,9 +20,6 @@ def verify(store: Store) -> Iterator[tuple[Path, str]]:
 
     A shard has no flaw if its digest is right, its loads are those that the scene draws, and each
     displacement is in equilibrium to the tolerance with det F > 0.
-
-    Raises:
-        DataSetError: There is no data set.
     """
     if not store.exists():
         raise DataSetError(f"{store.folder} holds no data set yet; generate it first")
@@ -41,9 +38,6 @@ def repair(store: Store) -> list[tuple[Path, str]]:
     """Remove damaged files from a data set; return each with its flaw and the action taken.
 
     Shards with loads that failed because of the machine are removed as well.
-
-    Raises:
-        DataSetError: Another process writes there.
     """
     if not store.exists():
         return []

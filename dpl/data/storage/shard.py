@@ -31,12 +31,7 @@ MAX_INTEGER = 2**53
 
 
 def encode_load(solved: SolvedLoad, parameters: Tensor) -> Columns:
-    """Return the columns of one load.
-
-    Args:
-        solved: The load.
-        parameters: Its parameters, (1, P), see `LoadFamily.parameter_ranges`.
-    """
+    """Return the columns of one load with its parameters (1, P)."""
     number = torch.tensor([solved.job.number])
     solution = {
         "index": number,
@@ -94,13 +89,8 @@ def digest(name: str, columns: Columns) -> str:
 
 
 def read_description(path: Path) -> Columns:
-    """Return the columns of `DESCRIPTION`; the digest of the file is not checked.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: A column is damaged, see `read_shard`.
-    """
-    return _read(path, DESCRIPTION)[0]
+    """Return the columns of `DESCRIPTION`, see `read_shard`; the digest is not checked."""
+    return _read(path, DESCRIPTION, None)
 
 
 def read_shard(
@@ -119,34 +109,35 @@ def read_shard(
         ValueError: A column is missing or has a wrong shape, type or value, or the digest is wrong.
             The message continues a sentence that starts with the name of the file.
     """
-    columns, stored = _read(path, (*TRIED, *SOLUTIONS, "reason"))
-    flaw = _flaw_of_solutions(columns, shape, dimension, n_parameters)
-    if not flaw and stored != digest(path.name, columns):
-        flaw = "the SHA-256 of its name and its columns is wrong"
-    if flaw:
-        raise ValueError(f"is damaged: {flaw}")
-    return columns
+    return _read(path, (*TRIED, *SOLUTIONS, "reason"), (shape, dimension, n_parameters))
 
 
-def _read(path: Path, names: Sequence[str]) -> tuple[Columns, str | None]:
-    """Return some columns, with those of `DESCRIPTION` checked, and the digest."""
+_Sizes = tuple[tuple[int, ...], int, int]  # (N, D), d and P
+
+
+def _read(path: Path, names: Sequence[str], sizes: _Sizes | None) -> Columns:
+    """Return some columns of a file; None as sizes for those of a description."""
     try:
         with safe_open(path, "pt") as file:
             # copied, because the memory of the tensors is that of the file
             columns = {name: file.get_tensor(name).clone() for name in names}
             stored = (file.metadata() or {}).get("sha256")
-        flaw = _flaw_of_description(columns)
+        flaw = _flaw(columns, sizes)
+        if sizes and not flaw and stored != digest(path.name, columns):
+            flaw = "the SHA-256 of its name and its columns is wrong"
     except (SafetensorError, KeyError, TypeError, RuntimeError) as error:
         flaw = str(error)
     if flaw:
         raise ValueError(f"is damaged: {flaw}")
-    return columns, stored
+    return columns
 
 
-def _flaw_of_description(columns: Columns) -> str:
+def _flaw(columns: Columns, sizes: _Sizes | None) -> str:
+    """Return the first flaw of some columns; empty without one."""
     count, accepted = len(columns["tried"]), len(columns["index"])
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(TRIED, (count,))
     shapes |= {"index": (accepted,), "reason": (count - accepted, REASON)}
+    shapes |= {"n_loaded_nodes": (accepted,)} if sizes else {}
     if flaw := _flaw_of_shapes(columns, shapes):
         return flaw
     tried, index, iterations = (columns[name] for name in ("tried", "index", "iterations"))
@@ -156,30 +147,24 @@ def _flaw_of_description(columns: Columns) -> str:
         return "an accepted load was not tried"
     if not ((iterations >= 0) & (iterations < MAX_INTEGER)).all():
         return "a number of iterations is out of range"
-    return "" if (columns["amplitude"] >= 0).all() else "an amplitude is negative"
-
-
-def _flaw_of_solutions(
-    columns: Columns, shape: tuple[int, ...], dimension: int, n_parameters: int
-) -> str:
-    count = len(columns["index"])
-    if flaw := _flaw_of_shapes(columns, {"n_loaded_nodes": (count,)}):
-        return flaw
+    if not (columns["amplitude"] >= 0).all():
+        return "an amplitude is negative"
+    if sizes is None:
+        return ""
+    (nodes, dim), dimension, n_parameters = sizes
     n_loaded_nodes = int(columns["n_loaded_nodes"].sum())
-    shapes = {
-        "point": (count, dimension),
+    shapes = dict.fromkeys(("residual", "volume_ratio"), (accepted,)) | {
+        "point": (accepted, dimension),
         "node": (n_loaded_nodes,),
-        "nodal_force": (n_loaded_nodes, shape[1]),
-        "displacement": (count, *shape),
-        "residual": (count,),
-        "volume_ratio": (count,),
-        "parameters": (count, n_parameters),
+        "nodal_force": (n_loaded_nodes, dim),
+        "displacement": (accepted, nodes, dim),
+        "parameters": (accepted, n_parameters),
     }
     if flaw := _flaw_of_shapes(columns, shapes):
         return flaw
-    if not ((columns["n_loaded_nodes"] >= 0) & (columns["n_loaded_nodes"] <= shape[0])).all():
+    if not ((columns["n_loaded_nodes"] >= 0) & (columns["n_loaded_nodes"] <= nodes)).all():
         return "a number of loaded nodes is negative or exceeds N"
-    if not ((columns["node"] >= 0) & (columns["node"] < shape[0])).all():
+    if not ((columns["node"] >= 0) & (columns["node"] < nodes)).all():
         return "a loaded node does not exist"
     return ""
 

@@ -27,7 +27,6 @@ from torch import Tensor
 
 from dpl.data.solving.solve import SolvedLoad
 from dpl.data.storage.acceptance import AmplitudeBin, acceptance_table, amplitude_bins
-from dpl.data.storage.journal import totals
 from dpl.data.storage.shard import (
     REASON,
     Columns,
@@ -40,9 +39,11 @@ from dpl.data.storage.shard import (
     to_dense,
 )
 from dpl.scene import Sample, Scene
-from dpl.system.files import DataSetError, read_regular_file, write_file
+from dpl.system.files import DataSetError, read_jsonl, read_regular_file, write_file
 
 FORMAT = 5
+JOURNAL = "journal.jsonl"
+MAX_DURATION = 1e15  # of a session in a journal, and its number of loads
 STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
 SHARD_NAME = re.compile(rf"({'|'.join(STREAMS)})-(\d{{6,16}})\.safetensors")
 HEADER = 100_000  # largest size of a shard without its numbers [bytes]
@@ -86,11 +87,7 @@ class Store:
         return self.seed, STREAMS[split]
 
     def exists(self) -> bool:
-        """Return True if the folder holds the data set, False if nothing is there.
-
-        Raises:
-            DataSetError: The folder holds something else.
-        """
+        """Return True if the folder holds the data set, False if nothing is there; else raise."""
         card = self.folder / "scene.json"
         if self.folder.exists() and not self.folder.is_dir():
             raise DataSetError(f"data.folder = {self.folder} must be a folder; choose another")
@@ -118,14 +115,8 @@ class Store:
         )
 
     def shards(self, split: str | None = None, block: int | None = None) -> list[Shard]:
-        """Return the shards, of one split or of one block; files that are none are left out.
-
-        Raises:
-            DataSetError: The folder holds something else.
-        """
-        if not self.exists():
-            return []
-        while True:
+        """Return the shards, of one split or of one block; files that are none are left out."""
+        while self.exists():
             found = []
             with suppress(FileNotFoundError):  # another writer merges files: read them again
                 for path in self.files():
@@ -136,6 +127,7 @@ class Store:
                         with suppress(ValueError):  # damaged; `verify` reports it
                             found.append(self.describe(path))
                 return found
+        return []
 
     def describe(self, path: Path) -> Shard:
         """Return a shard without its solutions; raise ValueError if it is damaged."""
@@ -148,9 +140,8 @@ class Store:
     def read(self, path: Path) -> Columns:
         """Return the columns of a shard; raise ValueError if it is damaged, see `read_shard`."""
         self._check_file(path)
-        loads = self.scene.loads
-        shape, n_parameters = self.scene.problem.shape, len(loads.parameter_ranges)
-        return read_shard(path, shape, loads.n_random, n_parameters)
+        shape, loads = self.scene.problem.shape, self.scene.loads
+        return read_shard(path, shape, loads.n_random, len(loads.parameter_ranges))
 
     def _check_file(self, path: Path) -> None:
         status = path.lstat()
@@ -181,10 +172,9 @@ class Store:
             )
 
     def missing(self, split: str, count: int, shard: int = 0, shards: int = 1) -> list[int]:
-        """Return which of the first `count` loads of a split have not been tried.
+        """Return which of the first `count` loads of a split writer `shard` has to solve.
 
-        Of several writers `shards`, who take blocks of `SHARD_SIZE` loads in turn, only the loads
-        of writer `shard` are returned.
+        The writers, `shards` in number, take blocks of `SHARD_SIZE` loads in turn.
         """
         tried = self.tried(split)
         return [
@@ -201,9 +191,6 @@ class Store:
         """Return the accepted ones of loads `first` to `count` - 1 of a split, in order.
 
         Another thread or process may solve loads of the data set at the same time.
-
-        Raises:
-            DataSetError: A shard is damaged, or there are no samples.
         """
         parts = self._columns(split, first, count)
         number = np.concatenate([np.zeros(0, int), *(part["index"].numpy() for part in parts)])
@@ -224,23 +211,20 @@ class Store:
         while True:
             found = []
             with suppress(FileNotFoundError):  # another writer merges files: read them again
-                for shard in self.shards(split):
-                    if any(first <= number < count for number in shard.tried):
-                        found.append(self._undamaged(shard.path))
+                for path, _, columns in self.shards(split):
+                    if any(first <= number < count for number in columns["tried"].tolist()):
+                        try:
+                            found.append(self.read(path))
+                        except ValueError as error:
+                            raise DataSetError(
+                                f"{path} {error}; scripts/generate.py action=repair with the same "
+                                "scene solves its loads again"
+                            ) from None
                 return found
-
-    def _undamaged(self, path: Path) -> Columns:
-        try:
-            return self.read(path)
-        except ValueError as error:
-            raise DataSetError(
-                f"{path} {error}; scripts/generate.py action=repair with the same scene solves its "
-                "loads again"
-            ) from None
 
     def write(self, solved: SolvedLoad) -> None:
         """Write a solved load to a file of its own."""
-        (split,) = (name for name in STREAMS if self.stream(name) == solved.job.seed)
+        split = list(STREAMS)[solved.job.seed[1]]
         path = self.folder / f"{split}-{solved.job.number:06d}.safetensors"
         point = torch.from_numpy(solved.point)[None]
         columns = encode_load(solved, self.scene.loads.parameters_at(point))
@@ -296,7 +280,7 @@ class Store:
         rejected = Counter(one for shard in self.shards() for one in reasons(shard.columns))
         lines += [f"  {count} rejected: {reason}" for reason, count in sorted(rejected.items())]
         lines += [f"  {row}" for row in acceptance_table(self.acceptance())]
-        sessions, loads, wall, core = totals(self.folder)
+        sessions, loads, wall, core = self._totals()
         if loads:
             size = sum(path.lstat().st_size for path in self.folder.glob("*.safetensors")) / 1e6
             lines.append(
@@ -307,8 +291,24 @@ class Store:
 
     def seconds_per_load(self) -> float | None:
         """Return the mean wall time per load over all sessions [s]; None before the first one."""
-        _, loads, seconds, _ = totals(self.folder)
+        _, loads, seconds, _ = self._totals()
         return seconds / loads if loads else None
+
+    def _totals(self) -> tuple[int, float, float, float]:
+        """Return numbers of sessions and of loads, wall time and core time of the journal [s].
+
+        Lines that do not give these numbers are left out.
+        """
+        keys = "loads", "seconds", "core_seconds"
+        lines = read_jsonl(self.folder / JOURNAL)
+        rows: list[list[Any]] = [[line.get(key) for key in keys] for line in lines]
+        valid = [
+            row
+            for row in rows
+            if all(type(one) in (int, float) and 0 <= one < MAX_DURATION for one in row)
+        ]
+        loads, wall, core = (sum(row[k] for row in valid) for k in range(len(keys)))
+        return len(valid), loads, wall, core
 
 
 def blocks(numbers: Iterable[int]) -> Iterator[tuple[int, list[int]]]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,8 +25,6 @@ INWARD = 1e-7  # shift of points on the surface into their cell, over the distan
 class FaceTractions(SurfaceLoads, VectorLoads):
     """Uniform dead traction of random direction and size on the whole region.
 
-    The numbers of a force are its size and its direction.
-
     Attributes:
         largest: Largest traction [Pa]; None: `deflection` decides.
     """
@@ -42,17 +40,12 @@ class FaceTractions(SurfaceLoads, VectorLoads):
 
 @dataclass(frozen=True, eq=False)
 class FacePressure(SurfaceLoads, CombinedLoads):
-    """Uniform dead pressure of random size on the whole region.
-
-    It acts against the outward normal of the undeformed body.
-
-    The number of a force is its size.
+    """Uniform dead pressure of random size on the whole region, inwards on the undeformed body.
 
     Attributes:
         pressure: Smallest and largest pressure [Pa]; None: from 0, `deflection` decides.
     """
 
-    size_option: ClassVar[str] = "pressure"
     pressure: Sequence[float] | None = option("Pa", default=None, nonzero=True)
 
     @cached_property
@@ -68,8 +61,6 @@ class GravityLoads(VectorLoads):
     """Weight of the body in random directions, with accelerations of random size.
 
     The nodal forces are consistent: at corners of quadratic tetrahedra they act against gravity.
-
-    The numbers of a force are its size and its direction.
 
     Attributes:
         density: Mass per rest volume [kg/m^3]; None: `deflection` decides.
@@ -89,10 +80,7 @@ class GravityLoads(VectorLoads):
 
     @cached_property
     def weights(self) -> Tensor:
-        """Integral of each shape function over the body, (N,) [-].
-
-        Integrals at corners of quadratic tetrahedra are negative: no masses of the nodes.
-        """
+        """Integral of each shape function over the body, (N,) [-]."""
         return body_force(self.problem, np.ones_like)[:, 0].contiguous()
 
 
@@ -104,14 +92,11 @@ class CableLoads(CombinedLoads):
     T (t_next - t_previous), and on an end T towards its neighbour. These are dead loads. The shape
     functions of its cell distribute the force on a point to nodes.
 
-    The numbers of a force are the tensions of the cables.
-
     Attributes:
         cables: Points of each cable in order, two or more, D coordinates each [m].
         tension: Smallest and largest tension [N] (2D: [N/m]); None: from 0, `deflection` decides.
     """
 
-    size_option: ClassVar[str] = "tension"
     cables: Sequence[Sequence[Sequence[float]]]
     tension: Sequence[float] | None = option("N", default=None, least=0.0, nonzero=True)
 
@@ -124,18 +109,17 @@ class CableLoads(CombinedLoads):
         """Force of the tension 1 in each cable, (K, N, D) [-]."""
         if not self.cables:
             raise ValueError("cables = [] must contain a cable: a list of points [m]")
-        return torch.stack([self._shape(k) for k in range(len(self.cables))])
-
-    def _shape(self, number: int) -> Tensor:
-        points = self._points(number)
-        step = np.diff(points, axis=0)
-        length = np.linalg.norm(step, axis=1, keepdims=True)
-        if not (length > 0).all():
-            raise ValueError(f"cables.{number} must not contain the same point twice in a row")
-        pulls = np.diff(step / length, axis=0, prepend=0.0, append=0.0)
-        with named_errors(f"cables.{number}: "):
-            weights = shape_functions(self.problem, points)
-        return torch.from_numpy(weights.T @ pulls)
+        shapes = []
+        for number in range(len(self.cables)):
+            points = self._points(number)
+            step = np.diff(points, axis=0)
+            length = np.linalg.norm(step, axis=1, keepdims=True)
+            if not (length > 0).all():
+                raise ValueError(f"cables.{number} must not contain the same point twice in a row")
+            pulls = np.diff(step / length, axis=0, prepend=0.0, append=0.0)
+            with named_errors(f"cables.{number}: "):
+                shapes.append(torch.from_numpy(shape_functions(self.problem, points).T @ pulls))
+        return torch.stack(shapes)
 
     def _points(self, number: int) -> Array:
         """Return the points of a cable over L, (P, D)."""

@@ -37,58 +37,43 @@ class LoadFamily(Protocol):
     @property
     def n_random(self) -> int:
         """d, dimension of the unit cube."""
-        ...
 
     @property
     def moduli(self) -> ParameterRange:
         """Range of Young's moduli with its distribution [Pa]; without width for one modulus."""
-        ...
 
     @property
     def parameter_ranges(self) -> Mapping[str, ParameterRange]:
         """Ranges of what differs between loads beside these, see `Problem.parameter_ranges`."""
-        ...
 
     @property
     def constant_force(self) -> Tensor | None:
         """Force that is part of every load, (N, D) [-]; None if there is none."""
-        ...
 
     @property
     def loadable_dofs(self) -> Tensor:
         """Free degrees of freedom on which these loads can act, (N, D), boolean."""
-        ...
 
     @property
     def largest_force(self) -> float:
-        """Norm of the largest force [-], the scale of residuals in the losses of the paper.
-
-        Raises:
-            ValueError: The body does not allow these loads.
-        """
-        ...
+        """Norm of the largest force [-], the scale of residuals in the losses of the paper."""
 
     def points(self, seed: int | Sequence[int], indices: Sequence[int]) -> Tensor:
         """Return the points of the unit cube of loads `indices` of a stream, (B, d)."""
-        ...
 
     def loads_at(self, points: Tensor) -> Load:
         """Return the loads of points (B, d) of the unit cube."""
-        ...
 
     def young_at(self, points: Tensor) -> Tensor:
         """Return the Young's moduli of points (B, d), (B,) [Pa]."""
-        ...
 
     def parameters_at(self, points: Tensor) -> Tensor:
         """Return the parameters of the law of points (B, d), (B, P), see `parameter_ranges`."""
-        ...
 
     def sample(
         self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0
     ) -> Load:
         """Return loads `indices` of the stream `seed`, their forces multiplied by `amplitude`."""
-        ...
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return amplitudes (B,) and distances (B,) of forces (B, N, D) [-] from the family.
@@ -99,18 +84,15 @@ class LoadFamily(Protocol):
         The distance is the part of the force that no load of the family explains, in [0, 1]. It is
         NaN where the family cannot recognise its loads.
         """
-        ...
 
     def identity(self) -> dict[str, Any]:
         """Return the options that determine the loads, as plain data, without Young's moduli.
 
         Options in SI units are to be divided by E and L, on whose ratios the samples depend.
         """
-        ...
 
     def skipped_work(self) -> list[str]:
         """Return notes for the plan that a command prints, one line each."""
-        ...
 
 
 @runtime_checkable
@@ -120,12 +102,10 @@ class HasModes(Protocol):
     @property
     def modal_forces(self) -> Tensor:
         """Mode times its largest modal load, zero on degrees of freedom without load, (N, D, M)."""
-        ...
 
     @property
     def patch_radius(self) -> Sequence[float]:
         """Smallest and largest radius of the loaded area over L [-]."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,9 +209,6 @@ class RandomLoads(LoadFamily):
         """Return ||f|| / `largest_force`, (B,), and the part outside `loadable_dofs`, (B,).
 
         The latter is NaN up to `MAX_DISTANCE`: only a subclass can recognise forces on these.
-
-        Args:
-            force: (B, N, D) [-].
         """
         own = self.own_force(force)
         size = own.flatten(1).norm(dim=1)
@@ -244,6 +221,11 @@ class RandomLoads(LoadFamily):
 
     def skipped_work(self) -> list[str]:
         return []
+
+    def __getstate__(self) -> dict[str, object]:
+        """Pickle with what the largest force needs, so that workers need not compute it again."""
+        self.largest_force  # noqa: B018
+        return self.__dict__
 
 
 @dataclass(frozen=True, eq=False)

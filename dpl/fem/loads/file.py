@@ -25,8 +25,6 @@ CANDIDATES = 4  # forces with the most similar sketches, which are compared with
 class FileLoads(CombinedLoads):
     """One of the forces of a file times a random factor.
 
-    The numbers of a force are its number in the file and the factor.
-
     Attributes:
         path: Nodal forces (S, N, D) [N] (2D: [N/m]), 2^27 numbers at most: a file of arrays or a
             folder of VTK files, see `dpl.fem.mesh.nodal_fields`. Each force acts on a free degree
@@ -65,22 +63,17 @@ class FileLoads(CombinedLoads):
             reason = error.strerror if isinstance(error, OSError) and error.strerror else error
             raise ValueError(f"path = {self.path}: {' '.join(str(reason).split())}") from error
 
-    @property
-    def _unit(self) -> float:
-        """Largest component of a force [N]."""
-        return float(np.abs(self._forces).max())
-
     @cached_property
     def shapes(self) -> Tensor:
         """Forces over their largest component, (S, N, D) [-]."""
-        return torch.from_numpy(self._forces / self._unit)
+        return torch.from_numpy(self._forces / np.abs(self._forces).max())
 
     @property
     def given_sizes(self) -> Array | None:
         """Smallest and largest factor times the largest component over E L^(D - 1), (2,) [-]."""
         if self.factor is None:
             return None
-        largest = self._unit * np.asarray(self.factor, dtype=np.float64)
+        largest = np.abs(self._forces).max() * np.asarray(self.factor, dtype=np.float64)
         return self.problem.units.force(largest, self.problem.shape[1], f"path = {self.path} [N]")
 
     @property
@@ -125,9 +118,8 @@ class FileLoads(CombinedLoads):
 
     def identity(self) -> dict[str, Any]:
         """Return the options; the file is identified by its forces over the largest component."""
-        options = super().identity()
-        for name in ("path", "field", "unit", "scale", "factor"):
-            del options[name]
+        unused = ("path", "field", "unit", "scale", "factor")
+        options = {key: one for key, one in super().identity().items() if key not in unused}
         return options | {"forces": plain(self.shapes)}
 
 

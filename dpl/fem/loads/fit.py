@@ -17,16 +17,11 @@ FITS = 1e-6  # distance from a family up to which a force belongs to it [-]
 def fit(
     shapes: Array, force: Array, low: float = -np.inf, high: float = np.inf
 ) -> tuple[Array, float]:
-    """Return the coefficients (K,) and the relative residual of a least-squares fit.
+    """Return the coefficients (K,) and the relative residual of a fit of shapes (N, D, K).
 
-    The fit is over the nodes on which a force acts. If the shapes are linearly dependent, the
-    coefficients with the smallest norm are returned, or coefficients in [low, high] of the same fit
-    if those are not. A zero force has the residual 0.
-
-    Args:
-        shapes: Fixed forces, (N, D, K).
-        force: The force, (N, D).
-        low, high: Range of the coefficients of a load.
+    The least-squares fit of a force (N, D) is over the nodes on which the force acts. If the shapes
+    are linearly dependent, the coefficients with the smallest norm are returned, or coefficients in
+    [low, high] of the same fit if those are not. A zero force has the residual 0.
     """
     unit = float(np.abs(force).max(initial=0.0))
     if unit == 0:
@@ -58,13 +53,10 @@ def fit(
 def project(
     shapes: Array, forces: Tensor, span: tuple[float, float], amplitude: Callable[[Array], Array]
 ) -> tuple[Tensor, Tensor]:
-    """Return the largest amplitudes and the relative residuals of forces, (B,) each, see `fit`.
+    """Return the largest amplitudes and the relative residuals of forces (B, N, D), (B,) each.
 
-    Args:
-        shapes: Fixed forces, (N, D, K).
-        forces: The forces, (B, N, D).
-        span: Range of the coefficients of a load.
-        amplitude: Function of the coefficients (K,) that returns amplitudes, (K,) or (1,).
+    `fit` has shapes (N, D, K) and the range of the coefficients, span; `amplitude` maps the
+    coefficients (K,) to amplitudes, (K,) or (1,).
     """
     fits = [fit(shapes, force, *span) for force in forces.numpy()]
     largest = [amplitude(coefficients).max() for coefficients, _ in fits]
@@ -106,13 +98,10 @@ def amplitudes(sizes: Array, low: float, high: float, largest: float) -> Array:
 
 
 def best_fit(amplitude: Array, distance: Array) -> NDArray[np.int_]:
-    """Return the numbers (B,) of the best of K fits of B forces.
+    """Return the numbers (B,) of the best of K fits of B forces, given (K, B) each.
 
-    It is the fit of the smallest distance, and of the smallest amplitude where several fit.
-
-    Args:
-        amplitude: (K, B).
-        distance: (K, B); NaN, where unknown, is better than any distance that does not fit.
+    It is the fit of the smallest distance, and of the smallest amplitude where several fit. An
+    unknown distance, NaN, is better than any distance that does not fit.
     """
     order = np.nan_to_num(distance.clip(min=FITS), nan=2 * FITS)
     return np.asarray(np.lexsort((amplitude, order), axis=0)[0])

@@ -95,8 +95,7 @@ def body_force(problem: Problem, density: Field) -> Tensor:
         problem: Where it acts.
         density: Force density times L/E [-] at dimensionless points; (D, ...) to (D, ...).
     """
-    basis = problem.basis
-    return _tested(basis, density(_places(problem, basis)))
+    return _integral(problem, problem.basis, density)
 
 
 def traction(problem: Problem, region: Region, stress: Field, scale: float = 1.0) -> Tensor:
@@ -110,17 +109,11 @@ def traction(problem: Problem, region: Region, stress: Field, scale: float = 1.0
             takes dimensionless points.
     """
     facets = facets_in(region, problem.mesh, scale, problem.origin)
-    basis = _facet_basis(problem, facets)
-    return _tested(basis, stress(_places(problem, basis)))
+    return _integral(problem, _facet_basis(problem, facets), stress)
 
 
 def facet_areas(problem: Problem, facets: NDArray[np.int_]) -> csr_matrix:
-    """Return the integrals of each shape function over each boundary facet, (N, E) [-].
-
-    Args:
-        problem: The body.
-        facets: Numbers of the facets, E of them.
-    """
+    """Return the integrals of each shape function over each of the facets (E,), (N, E) [-]."""
     basis = _facet_basis(problem, facets)
     areas = [(np.asarray(shape[0]) * basis.dx).sum(axis=1) for shape in basis.basis]  # E each
     columns = np.tile(np.arange(len(facets)), len(areas))
@@ -135,13 +128,10 @@ def _facet_basis(problem: Problem, facets: NDArray[np.int_]) -> skfem.FacetBasis
     return skfem.FacetBasis(problem.mesh, problem.basis.elem, facets=facets, intorder=4)
 
 
-def _places(problem: Problem, basis: skfem.Basis) -> NDArray[np.float64]:
-    """Return the quadrature points of a basis, (D, E, Q), where the body lies, over L."""
-    return np.asarray(basis.global_coordinates()) + problem.origin[:, None, None]
-
-
-def _tested(basis: skfem.Basis, values: NDArray[np.float64]) -> Tensor:
-    """Return the integral of values (D, E, Q) against each shape function, (N, D)."""
+def _integral(problem: Problem, basis: skfem.Basis, field: Field) -> Tensor:
+    """Return the integral of a field against each shape function, (N, D)."""
+    # where the body lies, over L
+    values = field(np.asarray(basis.global_coordinates()) + problem.origin[:, None, None])
     rows = np.broadcast_to(values, (len(values), *basis.dx.shape))
     forces = [skfem.LinearForm(lambda v, _, row=row: row * v).assemble(basis) for row in rows]
     return torch.from_numpy(np.stack(forces, axis=1))

@@ -35,12 +35,10 @@ class MixtureLoads(RandomLoads):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        weights = self.weights or {}
-        for name in weights:
+        for name, weight in (self.weights or {}).items():
             if name not in self.families:
                 known = ", ".join(self.families)
                 raise ValueError(f"weights.{name}: there is no such family; there are {known}")
-        for name, weight in zip(self.names, self._weights, strict=True):
             if not 0 <= weight < math.inf:
                 raise ValueError(f"weights.{name} = {weight} must be a number from 0")
         if not sum(self._weights) > 0:
@@ -94,11 +92,7 @@ class MixtureLoads(RandomLoads):
 
     @property
     def largest_force(self) -> float:
-        """Largest of the largest forces of the families [-].
-
-        Raises:
-            ValueError: The body does not allow the loads of a family.
-        """
+        """Largest of the largest forces of the families [-]."""
         sizes = []
         for name, member in zip(self.names, self.members, strict=True):
             with named_errors(f"families.{name}: "):
@@ -113,9 +107,8 @@ class MixtureLoads(RandomLoads):
         distance is NaN.
         """
         own = self.own_force(force)
-        fits = [torch.stack(member.project(own), dim=1) for member in self.members]
-        pairs = torch.stack(fits)  # (families, B, 2)
-        amplitude, distance = pairs.unbind(dim=2)
+        fits = zip(*(member.project(own) for member in self.members), strict=True)
+        amplitude, distance = map(torch.stack, fits)  # (families, B)
         best, columns = best_fit(amplitude.numpy(), distance.numpy()), range(len(own))
         return amplitude[best, columns], distance[best, columns]
 

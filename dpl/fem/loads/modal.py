@@ -34,8 +34,6 @@ class ModalLoads(SurfaceLoads):
     The force is multiplied by a random amplitude and set to 0 outside the boundary nodes within a
     random distance of a random node.
 
-    The numbers of a force are one per mode, then centre, radius and amplitude.
-
     Attributes:
         n_modes: Smallest number of modes. A cluster of close eigenvalues is never divided, so that
             there may be a few more.
@@ -63,9 +61,11 @@ class ModalLoads(SurfaceLoads):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.modes is not None and not _is_selection(self.modes):
+        modes = [0] if self.modes is None else self.modes
+        whole = all(isinstance(k, int) and not isinstance(k, bool) and k >= 0 for k in modes)
+        if not (modes and whole and all(a < b for a, b in pairwise(modes))):
             raise ValueError(
-                f"modes = {list(self.modes)} must be ascending whole numbers, 0 or more, or null"
+                f"modes = {list(modes)} must be ascending whole numbers, 0 or more, or null"
             )
         for name, low in (("distribution", -1.0), ("radius", 0.0), ("amplitude", 0.0)):
             drawn = getattr(self, name)(TESTED)
@@ -124,11 +124,7 @@ class ModalLoads(SurfaceLoads):
         The fit is over the nodes on which a force acts, so that the loaded area need not be a ball.
         The amplitude is max |q / q_max|: above 1 the force is larger than any load of this family,
         or, if `distribution` or `amplitude` leave out a part of [-1, 1], lies outside its range.
-        The residual ||f - Phi q|| / ||f|| is 0 for loads of this family. `constant_force` and
-        forces on fixed degrees of freedom do not count, see `Problem.acting`.
-
-        Args:
-            force: (B, N, D) [-].
+        The residual ||f - Phi q|| / ||f|| is 0 for loads of this family.
         """
         shapes, span = self.modal_forces.numpy(), self._span
         return project(shapes, self.own_force(force), span, lambda q: amplitudes(q, *span, 1.0))
@@ -151,14 +147,3 @@ class ModalLoads(SurfaceLoads):
         if self.modes is not None or count == self.n_modes:
             return []
         return [f"{count} modes instead of {self.n_modes}: a cluster of eigenvalues is kept whole"]
-
-    def __getstate__(self) -> dict[str, object]:
-        """Pickle with the modes, so that workers need not compute them again."""
-        self.eigenmodes  # noqa: B018
-        return self.__dict__
-
-
-def _is_selection(modes: Sequence[int]) -> bool:
-    """Return True for one or more ascending whole numbers, 0 or more."""
-    whole = all(isinstance(k, int) and not isinstance(k, bool) and k >= 0 for k in modes)
-    return bool(len(modes)) and whole and all(a < b for a, b in pairwise(modes))

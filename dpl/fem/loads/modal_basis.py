@@ -66,17 +66,11 @@ def eigenmodes(linear: LinearSolver, count: int) -> Modes:
     while count < requested and values[count] - values[count - 1] < CLUSTER * values[count]:
         count += 1
     probes = _probes(problem)
-    for space in _eigenspaces(values):
-        vectors[:, space] = _leaning(vectors[:, space], probes)
+    cuts = np.flatnonzero(np.diff(values) > SAME * values[1:]) + 1
+    for low, high in pairwise([0, *cuts.tolist(), len(values)]):
+        vectors[:, low:high] = _leaning(vectors[:, low:high], probes)
     fields = torch.stack([problem.extend(vector) for vector in vectors[:, :count].T], dim=-1)
     return Modes(torch.from_numpy(values[:count]), fields)
-
-
-def _eigenspaces(values: Array) -> list[slice]:
-    """Return the runs of eigenvalues that are one."""
-    cuts = np.flatnonzero(np.diff(values) > SAME * values[1:]) + 1
-    edges = [0, *cuts.tolist(), len(values)]
-    return [slice(a, b) for a, b in pairwise(edges)]
 
 
 def _probes(problem: Problem) -> Array:

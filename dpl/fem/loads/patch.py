@@ -29,8 +29,6 @@ class PatchLoads(SurfaceLoads, SizedLoads):
     vertices are all within a random distance of it. The distance is the length of the shortest path
     along edges and diagonals of facets, so that a disc does not jump across a gap.
 
-    The numbers of a force are centre, radius, size and direction.
-
     Attributes:
         largest: Largest traction [Pa]; None: `deflection` decides, with the largest disc around the
             node that yields most to forces.
@@ -43,7 +41,7 @@ class PatchLoads(SurfaceLoads, SizedLoads):
     @property
     def unit_deflection(self) -> float:
         """Linear deflection [-] of the traction 1 on the largest disc at the softest vertex."""
-        linear, nodes = self.linear.reference, self._nodes
+        linear, nodes = self.linear.reference, self.problem.basis.nodal_dofs[0]  # of vertices
         softest = softest_node(linear, torch.from_numpy(nodes[self.centres]))
         vertex = int(self.centres[np.flatnonzero(nodes[self.centres] == softest)[0]])
         axes = torch.eye(self.problem.shape[1], dtype=torch.float64)
@@ -164,12 +162,7 @@ class PatchLoads(SurfaceLoads, SizedLoads):
         return corners, halves, sizes[corners] - halves
 
     def weights_of(self, vertex: int, radius: float) -> Tensor:
-        """Return the integral of each shape function over a disc, (N,) [-].
-
-        Args:
-            vertex: Number of the vertex of the mesh at the centre.
-            radius: Radius [-].
-        """
+        """Return the integral of each shape function over a disc around a vertex, (N,) [-]."""
         distance = dijkstra(self._graph, indices=vertex, limit=radius * (1 + 1e-9))
         inside = np.isfinite(distance)[self._vertices].all(axis=0)
         around = (self._vertices == vertex).any(axis=0)
@@ -179,12 +172,8 @@ class PatchLoads(SurfaceLoads, SizedLoads):
     def centres(self) -> NDArray[np.int_]:
         """Vertices of the mesh on `facets` with a free degree of freedom, ascending, (V,)."""
         vertices = np.unique(self._vertices)
-        return vertices[self.loadable_dofs.any(dim=1).numpy()[self._nodes[vertices]]]
-
-    @property
-    def _nodes(self) -> NDArray[np.int_]:
-        """Node of each vertex of the mesh."""
-        return np.asarray(self.problem.basis.nodal_dofs[0])
+        nodes = self.problem.basis.nodal_dofs[0][vertices]
+        return vertices[self.loadable_dofs.any(dim=1).numpy()[nodes]]
 
     @cached_property
     def _vertices(self) -> NDArray[np.int_]:

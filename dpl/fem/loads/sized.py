@@ -5,7 +5,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ class SizedLoads(RandomLoads):
     """Base of load families whose forces have a random size.
 
     A subclass defines `unit_deflection`, and declares an option in Pa or N: the largest size, or
-    the range of sizes. `size_option` is its name.
+    the range of sizes.
 
     Attributes:
         deflection: Largest linear deflection over L [-]: the sizes lie between 0 and the size at
@@ -35,15 +35,14 @@ class SizedLoads(RandomLoads):
 
     _: KW_ONLY
     deflection: float = option("times L", default=0.2, least=MIN_DEFLECTION, most=10.0)
-    size_option: ClassVar[str] = "largest"
 
     @property
     def given_sizes(self) -> Array | None:
         """Smallest and largest size in the options, (2,) [-]; None if `deflection` decides."""
-        name, units = self.size_option, self.problem.units
+        options, units = declared(self), self.problem.units
+        name, unit = next((one.name, b.unit) for one, b in options if b.unit in ("Pa", "N"))
         if (value := getattr(self, name)) is None:
             return None
-        unit = next(bounds.unit for one, bounds in declared(self) if one.name == name)
         ends = np.array(value if isinstance(value, Sequence) else [0.0, value], dtype=np.float64)
         words = f"{name} = {shown(value)}"
         if unit == "Pa":
@@ -94,11 +93,6 @@ class SizedLoads(RandomLoads):
         del options["deflection"]
         return options | {"sizes": rounded(given)}
 
-    def __getstate__(self) -> dict[str, object]:
-        """Pickle with the sizes, so that workers need not compute them again."""
-        self.sizes  # noqa: B018
-        return self.__dict__
-
 
 @dataclass(frozen=True, eq=False)
 class CombinedLoads(SizedLoads):
@@ -114,7 +108,7 @@ class CombinedLoads(SizedLoads):
 
     @property
     def n_force(self) -> int:
-        """Number of random numbers: K, one for each coefficient."""
+        """K, a number for each coefficient."""
         return len(self.shapes)
 
     def coefficients_at(self, point: Array) -> Array:
@@ -220,12 +214,7 @@ def rounded(values: Array) -> list[float]:
 
 
 def largest_deflection(linear: LinearSolver, axes: Tensor) -> float:
-    """Return the largest linear deflection of a combination of forces with |c| = 1 [-].
-
-    Args:
-        linear: The body.
-        axes: The forces (K, N, D) [-].
-    """
+    """Return the largest linear deflection of a combination of axes (K, N, D), |c| = 1 [-]."""
     return float(_moved(linear, axes).max())
 
 
