@@ -30,7 +30,6 @@ from dpl.system.threads import one_thread
 from dpl.training import TrainedSurrogate
 
 ERROR = 1e-3  # estimated relative error in the modes at which the steps end [-]
-POOR_STREAM = 9_003  # of the loads by which the predictions are judged
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
 MAX_RESIDUAL = 1.0  # above it the error outside of the modes is not that of the training [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
@@ -122,13 +121,9 @@ class Simulator:
         request = Request.checked(tol, budget_ms, error, self._durations, warm=warm)
         given = as_numbers("force", force)
         load = as_load(self.scene, given, young, parameters)
-        # where tolerances are to be met in any time, a prediction is a start only
-        is_start_only = request.budget_ms is None and (request.tol, request.error) != (None, None)
         with one_thread(), torch.inference_mode():
             places = RangeCheck.of(self.surrogate, load)
-            guesses: Sequence[Guess | None] = [None] * len(load.force)
-            if not (is_start_only and self._is_poor):
-                guesses = self._guesses(load, places)
+            guesses = self._guesses(load, places)
             shared = (time.perf_counter() - request.begin) / len(load.force)
             answers = []
             for single, guess, place in zip(load.unbatch(), guesses, places, strict=True):
@@ -176,12 +171,10 @@ class Simulator:
         rows = zip(predictions.split(1), errors.tolist(), places, strict=True)
         return [Guess(u, *own) if place.inside else Guess(u) for u, own, place in rows]
 
-    def _solve(
-        self, load: Load, guess: Guess | None, place: RangeCheck, request: Request
-    ) -> Candidate:
+    def _solve(self, load: Load, guess: Guess, place: RangeCheck, request: Request) -> Candidate:
         """Return the first solution that meets the tolerances, else the best one.
 
-        Its error is estimated if that decides. `guess` is None if no prediction is tried.
+        Its error is estimated if that decides.
         """
         scene, tol = self.scene, request.residual_tol(self.scene)
         if not load.force.any() and not scene.problem.is_loaded_at_rest:
@@ -240,7 +233,7 @@ class Simulator:
         return candidate._replace(state=state, error=error, correction=found.correction)
 
     def _candidates(
-        self, load: Load, guess: Guess | None, place: RangeCheck, request: Request
+        self, load: Load, guess: Guess, place: RangeCheck, request: Request
     ) -> Iterator[tuple[Candidate, str]]:
         """Yield the solutions of the methods, the cheapest first, and what would follow.
 
@@ -249,25 +242,22 @@ class Simulator:
         seldom lead to a solution.
         """
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
-        starts, durations = [], request.durations
-        if guess is not None:
-            for first in self._predictions(load, guess, request):
-                yield first, "start"  # the last one is the best
-            if not request.is_more_than_prediction:
-                return
-            starts.append(first)
+        for first in self._predictions(load, guess, request):
+            yield first, "start"  # the last one is the best
+        if not request.is_more_than_prediction:
+            return
+        starts, durations = [first], request.durations
         with durations.timed("start"):
             if request.warm and self._before and torch.equal(self._before[0], load.parameters):
                 starts.append(Candidate.evaluated("last", problem, self._before[1], load, tol))
             distances = [self._distance(load, one) for one in starts]
-        start = None
-        if (least := min(distances, default=math.inf)) <= FAR:
-            start = starts[distances.index(least)].state.displacement
+        nearest = starts[distances.index(min(distances))]
+        start = nearest.state.displacement if min(distances) <= FAR else None
         stage = "Newton" if start is None or not self.scene.is_compact else "iteration"
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
             linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
             yield Candidate.evaluated("linear", problem, linear, load, tol), stage
-        elif starts and request.over(stage):
+        elif request.over(stage):
             return
 
         def newton_is_over() -> bool:  # called after the iterations without tangents
@@ -288,17 +278,6 @@ class Simulator:
             elif not state.converged:  # the initial state, which has been evaluated
                 continue
             yield Candidate("hybrid" if state.from_guess else "full Newton", state), stage
-
-    @cached_property
-    def _is_poor(self) -> bool:
-        """True if predictions of a few random loads are far, so that Newton from rest is faster."""
-        problem, tol = self.scene.problem, self.scene.solver.tol
-        for load in self.scene.loads.sample((0, POOR_STREAM), range(3)).unbatch():
-            u = self.surrogate.predict(load)
-            found = Candidate.evaluated("prediction", problem, u, load, tol)
-            if self._distance(load, found) <= FAR:
-                return False
-        return True
 
     def _distance(self, load: Load, candidate: Candidate) -> float:
         """Return the estimated relative error of a start [-]; one up to `FAR` may be rough."""
