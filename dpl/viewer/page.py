@@ -92,7 +92,7 @@ class Page:
         self._marker.drag_mesh.on_click(catch(self.click))
         for widgets, callback in (
             (controls.of_load, self.apply_controls),
-            (controls.of_moduli, lambda event: event.client is not None and self._submit()),
+            (controls.of_moduli, self.apply_moduli),
             (controls.of_settings, self.apply_settings),
             ((controls.mode,), self.apply_mode),
         ):
@@ -138,6 +138,11 @@ class Page:
         if event is not None and event.client is None:
             return
         self._submit(self.hand.hold(self.node, self.frame))
+
+    def apply_moduli(self, event: Any) -> None:
+        """Solve the last request with the moduli of the sliders."""
+        if event.client is not None:
+            self._submit()
 
     def apply_mode(self, event: Any = None) -> None:
         """Show the controls of the selected mode; the load or the grasp remains."""

@@ -170,14 +170,8 @@ def test_the_prediction_is_used_exactly_where_its_residual_is_smaller(scene, loa
     ("ratio_p", "ratio_1", "volume", "used"),
     [
         (0.5, 1.0, 0.9, True),
-        (1.0, 1.0, 0.9, False),
-        (2.0, 1.0, 0.9, False),
-        (0.5, 1.0, 0.0, False),
-        (0.5, 1.0, -1.0, False),
-        (0.5, 1.0, -torch.inf, False),
-        (torch.nan, 1.0, 0.9, False),
-        (torch.inf, 1.0, 0.9, False),
-        (0.5, 1.0, torch.nan, False),
+        *((ratio, 1.0, 0.9, False) for ratio in (1.0, 2.0, torch.nan, torch.inf)),
+        *((0.5, 1.0, volume, False) for volume in (0.0, -1.0, -torch.inf, torch.nan)),
     ],
 )
 def test_the_pick_rule_is_a_smaller_residual_with_nothing_inverted(ratio_p, ratio_1, volume, used):
@@ -273,26 +267,17 @@ def followed(scene, loads, guessed, **how):
     ("guessed", "goes_on"),
     [
         # the first correction is less than half of where it leads, upwards and downwards
-        ((1.0, 1.99), True),
-        ((1.0, 2.01), False),
-        ((1.0, 2.0), False),
-        ((1.0, 0.67), True),
-        ((1.0, 0.66), False),
+        *(((1.0, x), True) for x in (1.99, 0.67)),
+        *(((1.0, x), False) for x in (2.01, 2.0, 0.66, torch.nan, torch.inf)),
         ((0.0, 1e-9), False),
-        ((1.0, torch.nan), False),
-        ((1.0, torch.inf), False),
         # the second one is less than half of the first, or a tenth of where it leads
-        ((1.0, 1.4, 1.59), True),
-        ((1.0, 1.4, 1.61), False),
-        ((1.0, 1.01, 1.12), True),
-        ((1.0, 1.01, 1.13), False),
+        *(((1.0, 1.4, x), x < 1.6) for x in (1.59, 1.61)),
+        *(((1.0, 1.01, x), x < 1.125) for x in (1.12, 1.13)),
         ((1.0, 1.0, 1.11), True),
         # the third one and those that follow are less than half of the one before
-        ((1.0, 1.2, 1.28, 1.319), True),
-        ((1.0, 1.2, 1.28, 1.321), False),
+        *(((1.0, 1.2, 1.28, x), x < 1.32) for x in (1.319, 1.321)),
         ((1.0, 1.2, 1.21, 1.2151), False),
-        ((1.0, 1.2, 1.28, 1.31, 1.324), True),
-        ((1.0, 1.2, 1.28, 1.31, 1.326), False),
+        *(((1.0, 1.2, 1.28, 1.31, x), x < 1.325) for x in (1.324, 1.326)),
     ],
 )
 def test_newton_goes_on_from_a_prediction_while_its_corrections_contract(
