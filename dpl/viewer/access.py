@@ -25,7 +25,7 @@ from typing import Any
 import websockets.asyncio.server
 from websockets.http11 import Request, Response
 
-RequestHandler = Callable[[Any, Request], Response | None]  # of a connection
+RequestHandler = Callable[[Any, Request], Response | None]
 MAX_MESSAGE = 2**18  # largest message from the browser [bytes]
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 HEADERS = {
