@@ -300,12 +300,12 @@ def moving_hand(
     times: list[float] = []
     errors: list[float] = []
     for grasp in grasps:
-        gripper = Gripper(surrogate, steps=steps)
+        gripper = Gripper(surrogate, steps=steps, warm=True)
         for k in range(1, frames + 1):
             part = grasp.scaled(k / frames)
             motion = part.region, part.translation, part.rotation
             begin = time.perf_counter()
-            answer = gripper(*motion, budget_ms=budget_ms, warm=True)
+            answer = gripper(*motion, budget_ms=budget_ms)
             (times if k > 1 else first).append(1e3 * (time.perf_counter() - begin))
             if k % CHECKED == 0:
                 patch = gripper.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())

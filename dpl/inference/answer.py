@@ -1,17 +1,18 @@
-"""Answers of the simulator and their summaries in words."""
+"""Answers of the simulator, their summaries in words, and the range of the training."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
 
-from dpl.fem import Solution, Status
+from dpl.fem import Load, Solution, Status
 from dpl.fem.loads.family import MAX_DISTANCE
 from dpl.inference.request import Candidate, Request
 from dpl.scene import Scene
+from dpl.training import TrainedSurrogate
 
 ROUNDOFF = 1e-9  # relative error of amplitudes [-]
 UNRELIABLE = 0.1  # estimated error from which a grasp is reported [-]
@@ -63,42 +64,68 @@ class Answer:
     summary: Any
 
 
-def fields_of(
-    best: Candidate, place: tuple[float, float, bool], request: Request, scene: Scene
-) -> tuple[Any, ...]:
-    """Return the fields of `Answer` for one solution; `place` is its `RangeCheck`."""
-    state, error = best.state, best.known_error
-    residual, converged = float(state.residual), best.is_exact
-    kept = converged and residual < request.residual_tol(scene)
-    rest = best.method == "rest" and converged
-    words = "no load: at rest" if rest else summarise(state, kept, error, *place)
-    displacement = scene.length * state.displacement[0]
+class RangeCheck(NamedTuple):
+    """Position of a load relative to the range of the training."""
+
+    amplitude: float  # as of `Answer` [-]
+    out_of_span: float  # as of `Answer` [-]
+    outside: bool  # the load is known to be out of range
+
+    @classmethod
+    def of(cls, surrogate: TrainedSurrogate, load: Load) -> list[Self]:
+        """Return the positions of loads relative to the range of a surrogate's scene."""
+        loads = surrogate.scene.loads
+        inputs = list(zip(load.parameters.unbind(1), loads.parameter_ranges.values(), strict=True))
+        if surrogate.predictor.reads_young:
+            inputs.append((load.young, loads.moduli))
+        amplitudes, distances = (column.tolist() for column in loads.project(load.force))
+        places = []
+        for k, (amplitude, out_of_span) in enumerate(zip(amplitudes, distances, strict=True)):
+            outside = amplitude > 1 + ROUNDOFF or out_of_span > MAX_DISTANCE
+            outside |= any(not low <= float(values[k]) <= high for values, (low, high) in inputs)
+            places.append(cls(amplitude, out_of_span, outside))
+        return places
+
+    @property
+    def inside(self) -> bool:
+        """True where the load is known to be in range."""
+        return not (self.outside or math.isnan(self.out_of_span))
+
+
+def answer_of(best: Candidate, place: RangeCheck, request: Request, scene: Scene) -> Answer:
+    """Return the answer of a solution of one load, whose displacement is a tensor."""
+    state, error, milliseconds = best.state, best.known_error, request.milliseconds
+    residual = float(state.residual)
+    kept = best.is_exact and residual < request.residual_tol(scene)
+    rest = best.method == "rest" and best.is_exact
+    words = "no load: at rest" if rest else summarise(state, kept, error, place)
     numbers = residual, error, float(state.volume_ratio), kept, int(state.negative_pivots)
-    counts = best.method, int(state.iterations), request.milliseconds
-    return (displacement, *numbers, *place, *counts, words)
+    counts = best.method, int(state.iterations), milliseconds
+    return Answer(scene.length * state.displacement[0], *numbers, *place, *counts, words)
 
 
-def summarise(
-    state: Solution,
-    kept: bool,
-    error: float,
-    amplitude: float,
-    out_of_span: float,
-    outside: bool,
-) -> str:
-    """Return the summary of one solution in words: error, residual, stability and range.
+def stacked(answers: Sequence[Answer], *, numpy: bool) -> Answer:
+    """Return the answers to B loads as one, with arrays of NumPy or with tensors and lists."""
+    columns = {name: [vars(one)[name] for one in answers] for name in vars(answers[0])}
+    displacement = torch.stack(columns.pop("displacement"))
+    arrays = {name: np.array(column) for name, column in columns.items()}
+    if numpy:
+        return Answer(displacement.numpy(), **arrays)
+    return Answer(displacement.clone(), **{
+        name: column.tolist() if column.dtype.kind == "U" else torch.from_numpy(column)
+        for name, column in arrays.items()
+    })  # fmt: skip
 
-    Args:
-        state: The solution.
-        kept: The residual is below the tolerance.
-        error: Estimated relative error of the displacement [-].
-        amplitude, out_of_span: See `Answer`.
-        outside: The load is out of the training range.
-    """
+
+def summarise(state: Solution, kept: bool, error: float, place: RangeCheck) -> str:
+    """Return estimated error, residual (`kept`: below the tolerance), stability and range."""
     if not float(state.volume_ratio) > 0:
         words = "NOT VALID: an element is inverted"
     else:
-        words = f"{_accuracy(error)}, residual {float(state.residual):.1e} of the load"
+        words = "displacement unknown, its estimated error exceeds 100 %"
+        if error < UNKNOWN:
+            words = f"displacement within about {relative(error)} (estimated)"
+        words += f", residual {float(state.residual):.1e} of the load"
         if kept:
             words += " (converged)"
         elif state.converged:
@@ -114,44 +141,17 @@ def summarise(
         words += ", the tangent has negative curvature: near or beyond a critical load"
     if int(state.status) == Status.NO_VALID_EQUILIBRIUM:
         words += f"; no equilibrium found beyond {float(state.load_factor):.2f} of the load"
-    if not outside:
-        return words + "; the load family cannot recognise its loads" * math.isnan(out_of_span)
-    if out_of_span > MAX_DISTANCE:
-        return words + f"; {out_of_span:.0%} of the load is unlike the training's"
-    if amplitude > 1 + ROUNDOFF:
-        off = f"{amplitude - 1:.2g} times the training's largest"
+    if not place.outside:
+        unknown = math.isnan(place.out_of_span)
+        return words + "; the load family cannot recognise its loads" * unknown
+    if place.out_of_span > MAX_DISTANCE:
+        return words + f"; {place.out_of_span:.0%} of the load is unlike the training's"
+    if place.amplitude > 1 + ROUNDOFF:
+        off = f"{place.amplitude - 1:.2g} times the training's largest"
         return words + f"; the size of the load is out of range by {off}"
     return words + "; a modulus lies outside the training's range"
-
-
-def _accuracy(error: float) -> str:
-    """Return an estimated relative error in words."""
-    if not error < UNKNOWN:
-        return "displacement unknown, its estimated error exceeds 100 %"
-    return f"displacement within about {relative(error)} (estimated)"
 
 
 def relative(error: float) -> str:
     """Return a relative error as text, in percent unless it is very small."""
     return f"{100 * error:.2g} %" if error >= LEAST_PERCENTAGE else f"{error:.1e}"
-
-
-def answer_of(rows: Sequence[tuple[Any, ...]], *, numpy: bool, single: bool) -> Answer:
-    """Return the answer to one load or several, in NumPy or torch as the force was given.
-
-    Args:
-        rows: Fields of `Answer` for each load: a tensor (N, D), then numbers and texts.
-        numpy: Return NumPy arrays.
-        single: Return the fields of the only load, without a leading axis.
-    """
-    displacements, *columns = zip(*rows, strict=True)
-    if single:
-        values = [column[0] for column in columns]
-    else:
-        values = [np.array(column) for column in columns]
-        if not numpy:
-            values = [torch.from_numpy(x) if x.dtype.kind != "U" else x.tolist() for x in values]
-    displacement = displacements[0] if single else torch.stack(displacements)
-    if numpy:
-        return Answer(displacement.numpy(), *values)
-    return Answer(displacement.clone(), *values)  # an ordinary tensor, not one of inference

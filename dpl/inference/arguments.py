@@ -14,11 +14,7 @@ from dpl.scene import Scene
 
 
 def as_numbers(name: str, value: Any) -> Tensor:
-    """Return a copy of an argument as a float64 tensor on the CPU.
-
-    Raises:
-        ValueError: It contains values that are no real numbers.
-    """
+    """Return a copy of real numbers as a float64 tensor on the CPU."""
     refused = f"{name} must be real numbers"
     if isinstance(value, Tensor):
         if value.layout != torch.strided or value.is_meta or value.is_quantized:
@@ -29,7 +25,8 @@ def as_numbers(name: str, value: Any) -> Tensor:
     try:
         array = np.asarray(value)
         real = array.dtype.kind in "iuf" or (
-            array.dtype.kind == "O" and all(map(_is_real, array.flat))
+            array.dtype.kind == "O"
+            and all(isinstance(x, Real) and not isinstance(x, bool) for x in array.flat)
         )
         numbers = np.array(array, np.float64, order="C", subok=False) if real else None
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:
@@ -42,16 +39,8 @@ def as_numbers(name: str, value: Any) -> Tensor:
     return torch.from_numpy(numbers)
 
 
-def _is_real(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
 def as_number(name: str, value: Any) -> float | None:
-    """Return an argument as a number, None for None.
-
-    Raises:
-        ValueError: It is not one number.
-    """
+    """Return an argument as a number, None for None."""
     if value is None:
         return None
     number = as_numbers(name, value)
@@ -72,16 +61,9 @@ def per_load(name: str, value: Any, count: int) -> Tensor:
 
 
 def named_columns(name: str, value: Any, names: Sequence[str], count: int) -> Tensor:
-    """Return an argument that gives values by name, or all as an array, as columns (B, P).
+    """Return values as columns (B, P) of P names, from a mapping, an array (B, P) or None.
 
-    Args:
-        name: Name of the argument.
-        value: Mapping from names to one number or (B,); an array (B, P); None for no values.
-        names: The P names.
-        count: B.
-
-    Raises:
-        ValueError: A value is missing or superfluous, or has a wrong shape.
+    B is `count`; a value of a mapping is one number or (B,).
     """
     if isinstance(value, Mapping):
         if set(value) != set(names):
@@ -99,16 +81,13 @@ def named_columns(name: str, value: Any, names: Sequence[str], count: int) -> Te
 
 
 def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
-    """Return the arguments of a call as a dimensionless load.
+    """Return the arguments of a call, see `Simulator.__call__`, as a dimensionless load.
 
     Args:
         scene: The scene.
         force: Nodal forces, (N, D) or (B, N, D) [N] (2D: [N/m]), float64.
         young: Young's modulus, one number or (B,) [Pa]; None: that of the scene.
         parameters: Values of the ranges of the body, see `named_columns`.
-
-    Raises:
-        ValueError: An argument has a wrong shape, is not finite, or is out of range.
     """
     shape = scene.problem.shape
     if force.shape[-2:] != shape or force.ndim not in (2, 3) or not force.numel():
@@ -118,7 +97,14 @@ def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
     largest = force.flatten(1).abs().amax(dim=1)
     if not largest.isfinite().all():  # NaN if an entry is, also at fixed degrees of freedom
         raise ValueError("force: a number is not finite")
-    moduli = _moduli(scene, young, len(force))
+    low, high = scene.loads.moduli
+    if young is None and low < high:
+        raise ValueError(f"young: the scene has a range, {low:g} to {high:g} Pa; say which")
+    moduli = per_load("young", low if young is None else young, len(force))
+    if not (moduli > 0).all():
+        raise ValueError("young: a modulus is not above 0 Pa")
+    for modulus in moduli.tolist():
+        scene.problem.check_modulus(modulus)
     values = named_columns("parameters", parameters, list(scene.loads.parameter_ranges), len(force))
     own = scene.problem.law_parameters(values)
     scene.problem.material.with_parameters(own)  # refuses values that it does not allow
@@ -131,18 +117,3 @@ def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
             "float64 holds; check the units of force and young"
         )
     return scene.load_of(force, moduli, values)
-
-
-def _moduli(scene: Scene, young: Any, count: int) -> Tensor:
-    """Return Young's moduli (B,) [Pa] of a call."""
-    low, high = scene.loads.moduli
-    if young is None and low < high:
-        raise ValueError(f"young: the scene has a range, {low:g} to {high:g} Pa; say which")
-    if young is None:
-        return torch.full((count,), low, dtype=torch.float64)
-    moduli = per_load("young", young, count)
-    if not (moduli > 0).all():
-        raise ValueError("young: a modulus is not above 0 Pa")
-    for modulus in moduli.tolist():
-        scene.problem.check_modulus(modulus)
-    return moduli

@@ -1,10 +1,10 @@
 """Grasps: the displacement of a patch is prescribed, its forces are found through a network."""
 
 import math
-import time
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import nullcontext
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dpl.fem import Load, RigidPatch, evaluate_solution
-from dpl.inference.answer import UNRELIABLE, Answer, fields_of, relative
+from dpl.inference.answer import UNRELIABLE, Answer, RangeCheck, answer_of, relative
 from dpl.inference.arguments import as_load, as_numbers
-from dpl.inference.held_body import MAX_ITER, MOTION_TOL, HeldBody, predicted_forces
+from dpl.inference.held_body import MAX_ITER, MOTION_TOL, HeldBody
 from dpl.inference.request import FINISH, Candidate, Durations, Request
-from dpl.inference.training_range import RangeCheck
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import TrainedSurrogate
@@ -77,35 +76,38 @@ class GraspAnswer(Answer):
 
 
 class Grip(NamedTuple):
-    """A state of a grasped body, from which the next motion of its patch starts.
-
-    Attributes:
-        patch: The patch.
-        motion: Its translation over L [-] and rotation vector [rad].
-        force: Forces of the gripper at held degrees of freedom, (m,) [-].
-        field: Displacement, (N, D) [-].
-    """
+    """A state of a grasped body, from which the next motion of its patch starts."""
 
     patch: RigidPatch
-    motion: Tensor
-    force: Tensor
-    field: Tensor
+    motion: Tensor  # translation over L [-] and rotation vector [rad]
+    force: Tensor  # of the gripper at held degrees of freedom, (m,) [-]
+    field: Tensor  # displacement, (N, D) [-]
 
 
+@dataclass(frozen=True, eq=False)
 class Gripper:
     """Grasps of a body, with the last patches and the state of the last grasp.
+
+    Grippers from `dataclasses.replace(gripper, warm=True)` have these in common.
 
     Attributes:
         surrogate: The surrogate that predicts displacements.
         steps: Largest number of corrections of a prediction.
+        warm: Begin with the state of the last grasp if it was of the same patch: the answer is the
+            last displacement, moved with the patch and corrected, if that is accurate.
+        sliding: Hold the largest part of a patch that faces one way along a coordinate axis, along
+            this axis alone, as a flat plate does that is lubricated and does not lift off.
+            Components of the motion across have no effect.
     """
 
-    def __init__(self, surrogate: TrainedSurrogate, *, steps: int) -> None:
-        """Store the surrogate; a patch is prepared when it is grasped for the first time."""
-        self.surrogate, self.steps = surrogate, steps
-        self._patches: OrderedDict[bytes, RigidPatch] = OrderedDict()
-        self._last: Grip | None = None
-        self._durations = Durations()
+    surrogate: TrainedSurrogate
+    _: KW_ONLY
+    steps: int
+    warm: bool = False
+    sliding: bool = False
+    _patches: OrderedDict[bytes, RigidPatch] = field(default_factory=OrderedDict, repr=False)
+    _last: list[Grip] = field(default_factory=list, repr=False)  # at most one
+    _durations: Durations = field(default_factory=Durations, repr=False)
 
     @property
     def scene(self) -> Scene:
@@ -123,16 +125,15 @@ class Gripper:
         parameters: Mapping[str, float] | ArrayLike | None = None,
         tol: float | None = None,
         budget_ms: float | None = None,
-        warm: bool = False,
-        sliding: bool = False,
     ) -> GraspAnswer:
         """Return the displacement of the body while a gripper moves a patch of its boundary.
 
         The nodes of the patch move as a rigid body. The forces of the gripper are found through
-        predictions of the network, see `predicted_forces`; the prediction is corrected, see
-        `HeldBody.corrected`. Large rotations, and motions whose correction is not near equilibrium,
-        are made in parts from rest, each of which is corrected. With a tolerance, Newton's method
-        solves the equilibrium of the body with the patch as a moved support, from this state.
+        predictions of the network (`HeldBody.predicted_forces`); the prediction is corrected
+        (`HeldBody.corrected`). Large rotations, and motions whose correction is not near
+        equilibrium, are made in parts from rest, each of which is corrected. With a tolerance,
+        Newton's method solves the equilibrium of the body with the patch as a moved support, from
+        this state.
 
         Args:
             region: The patch: a region of `dpl.fem` in the coordinates of the mesh, or a mask of
@@ -149,53 +150,43 @@ class Gripper:
             budget_ms: Wall time [ms]. No prediction, correction and iteration is started that would
                 exceed it, see `Durations`. The body is at rest in the answer until a new patch is
                 prepared, for which each call uses its budget.
-            warm: Begin with the state of the last call if it grasped the same patch: the answer is
-                the last displacement, moved with the patch and corrected, if that is accurate.
-            sliding: Hold the largest part of the patch that faces one way along a coordinate axis,
-                along this axis alone, as a flat plate does that is lubricated and does not lift
-                off. Components of the motion across have no effect.
 
         Raises:
             ValueError: An argument has a wrong shape or is out of range, the patch has no node that
                 is free to move, or a patch that slides faces no axis.
         """
-        begin = time.perf_counter()
-        request = replace(
-            Request.checked(tol, budget_ms, None, warm=warm),
-            begin=begin, durations=self._durations,
-        )  # fmt: skip
+        request = Request.checked(tol, budget_ms, None, self._durations, warm=self.warm)
         load = self._load(force, young, parameters)
         motion, directions = self._motion(translation, rotation)
-        patch = self.patch(region, directions, load.parameters, sliding=sliding)
+        patch = self.patch(region, directions, load.parameters)
+        last = self._last.pop() if self._last else None
         with one_thread(), torch.inference_mode():
-            last = self._last if warm and self._last and self._last.patch is patch else None
-            self._last = None
             if not self._is_prepared(patch, request):
                 with self._durations.timed(FINISH):
                     return self._at_rest(patch, motion, load, request)
-            body, found = self._held(patch, motion, load, request), False
+            if last is not None and not (self.warm and last.patch is patch):
+                last = None
+            body = self._held(patch, motion, load, request)
             best: Candidate | None = None
-            clock = time.perf_counter()
-            for candidate, is_found in self._states(body, motion, load, last, request):
-                now = time.perf_counter()
-                self._durations.add("state", now - clock)
-                clock = now
+            states = self._states(body, motion, load, last, request)
+            for candidate in self._durations.each("state", states):
                 candidate = body.with_errors(candidate, request)
                 if best is None or candidate.known_error < best.known_error:
-                    best, found = candidate, is_found
+                    best = candidate
                 if best.known_error <= ACCURATE or request.over("state", "errors"):
                     break
             assert best is not None
             reached = best  # also with a tolerance, so that a hand does not depend on comparisons
             if request.tol is not None and not best.is_exact and not request.over("Newton"):
-                solved = body.equilibrium(best.state.displacement, request)
-                solved = body.with_errors(solved, request)
+                solved = body.equilibrium(best, request)
                 best = min(best, solved, key=lambda one: (not one.is_exact, one.known_error))
             with self._durations.timed(FINISH):
                 is_near = request.spent or reached.known_error <= UNRELIABLE
                 if is_near and reached.force is not None:
-                    self._last = Grip(patch, motion, reached.force, reached.state.displacement[0])
-                return self._reported(body, load, best, request, found=found)
+                    self._last.append(
+                        Grip(patch, motion, reached.force, reached.state.displacement[0])
+                    )
+                return self._reported(body, load, best, request)
 
     def _at_rest(
         self, patch: RigidPatch, motion: Tensor, load: Load, request: Request
@@ -206,17 +197,14 @@ class Gripper:
         state = evaluate_solution(newton.problem, newton.problem.prescribed[None], load, newton.tol)
         missed, force = float(patch.at(goal).norm(dim=1).max()), torch.zeros_like(goal)
         best = Candidate("rest", state, math.inf, motion_error=missed, force=force)
-        return self._reported(HeldBody(patch, goal, load, newton), load, best, request, found=False)
+        return self._reported(HeldBody(patch, goal, load, newton), load, best, request)
 
     def _is_prepared(self, patch: RigidPatch, request: Request) -> bool:
         """Prepare a patch as far as the budget allows; return True if the call can go on."""
         while missing := patch.missing_rows:
-            each = self._durations.forecast("row") or math.inf
-            one = missing * each > request.seconds_left
-            begin = time.perf_counter()
-            patch.prepare(one=one)
-            if one:
-                self._durations.add("row", time.perf_counter() - begin)
+            one = missing * (self._durations.forecast("row") or math.inf) > request.seconds_left
+            with self._durations.timed("row") if one else nullcontext():
+                patch.prepare(one=one)
             if request.over("row" if patch.missing_rows else "state"):
                 return False
         return True
@@ -235,25 +223,24 @@ class Gripper:
 
     def _states(
         self, body: HeldBody, motion: Tensor, load: Load, last: Grip | None, request: Request
-    ) -> Iterator[tuple[Candidate, bool]]:
-        """Yield states at a motion, and whether the forces of the network were found.
+    ) -> Iterator[Candidate]:
+        """Yield states at a motion, from the last state, the prediction and, in parts, from rest.
 
-        They continue from the last state, from the prediction and, in parts, from rest. Large
-        rotations are not predicted unless nothing else leads to a state.
+        Large rotations are not predicted unless nothing else leads to a state.
         """
         patch = body.patch
         rest = Grip(patch, 0 * motion, 0 * body.goal, torch.zeros(patch.held.shape).double())
         is_predicted = not self.steps or self._parts(motion) * MAX_TURN < MAX_PREDICTED_TURN
         if last is not None and self.steps:
             parts = self._parts(motion - last.motion)
-            if (state := self._in_parts(body, last, motion, parts, load, request)) is not None:
-                yield state, True
+            if state := self._in_parts(body, last, motion, parts, load, request):
+                yield state._replace(forces_found=True)
         if is_predicted:
             yield self._predicted(body, load, last or rest, request)
         for doubled in PARTS if self.steps else ():
             parts = doubled * self._parts(motion)
-            if (state := self._in_parts(body, rest, motion, parts, load, request)) is not None:
-                yield state, False
+            if state := self._in_parts(body, rest, motion, parts, load, request):
+                yield state
         if not is_predicted:
             yield self._predicted(body, load, rest, request)
 
@@ -278,24 +265,25 @@ class Gripper:
             best = found._replace(state=found.state._replace(iterations=torch.tensor([count])))
         return best
 
-    def _predicted(
-        self, body: HeldBody, load: Load, start: Grip, request: Request
-    ) -> tuple[Candidate, bool]:
-        """Return the corrected prediction, and whether its forces are found.
+    def _predicted(self, body: HeldBody, load: Load, start: Grip, request: Request) -> Candidate:
+        """Return the corrected prediction.
 
-        If they are not, the linear displacement that closes the gap of the patch is added to a
-        prediction that is not corrected, and the forces of this displacement to its forces.
+        Where its forces are not found, the linear displacement that closes the gap of the patch is
+        added to a prediction that is not corrected, and the forces of this displacement to its own.
         """
         patch, newton = body.patch, body.newton
-        begin = start.force + patch.stiffness_times(body.goal - body.patch.of_field(start.field))
+        begin = start.force + patch.stiffness_times(body.goal - patch.of_field(start.field))
 
         def predict(own: Tensor) -> Tensor:
             with request.durations.timed("prediction"):
                 return self.surrogate.predict(load._replace(force=load.force + own))[0]
 
+        scale = 0.0  # largest displacement of the patch without the gripper, predicted [-]
+        if bool(load.force.any()):
+            scale = float(patch.of_field(self.surrogate.predict(load)[0]).abs().max())
         tol, most = (CORRECTED_GAP, CORRECTED_ITER) if self.steps else (MOTION_TOL, MAX_ITER)
-        force, field, count, is_found = predicted_forces(
-            patch, body.goal, predict, begin, scale=self._motion_without(patch, load),
+        force, field, count, is_found = body.predicted_forces(
+            predict, begin, scale=scale if math.isfinite(scale) else 0.0,
             tol=tol, max_iter=most, is_over=lambda: request.over("prediction", "errors"),
         )  # fmt: skip
         best = None
@@ -311,7 +299,7 @@ class Gripper:
             )
             best = Candidate("prediction", state, force=force)
         state = best.state._replace(iterations=best.state.iterations + count)
-        return best._replace(state=state), is_found
+        return best._replace(state=state, forces_found=is_found)
 
     def _load(self, force: Any, young: Any, parameters: Any) -> Load:
         """Return the other forces on the body as a load, B = 1."""
@@ -346,20 +334,13 @@ class Gripper:
         motion = motion.where(motion.abs() >= LEAST_MOTION, 0.0)
         return motion, [x is not None for x in moves]
 
-    def patch(
-        self,
-        region: Any,
-        directions: Sequence[bool],
-        parameters: Tensor,
-        *,
-        sliding: bool = False,
-    ) -> RigidPatch:
+    def patch(self, region: Any, directions: Sequence[bool], parameters: Tensor) -> RigidPatch:
         """Return a patch, one of the last `MAX_PATCHES` or a new one; see `RigidPatch.of`.
 
         `parameters` are those of the law, (1, P).
         """
         linear = self.scene.linear.with_parameters(parameters)
-        patch = RigidPatch.of(linear, region, directions, sliding=sliding)
+        patch = RigidPatch.of(linear, region, directions, sliding=self.sliding)
         key = patch.held.numpy().tobytes() + parameters.numpy().tobytes()
         patch = self._patches.setdefault(key, patch)
         self._patches.move_to_end(key)
@@ -367,17 +348,10 @@ class Gripper:
             self._patches.popitem(last=False)
         return patch
 
-    def _motion_without(self, patch: RigidPatch, load: Load) -> float:
-        """Return the largest displacement of the patch without the gripper, predicted [-]."""
-        if not bool(load.force.any()):
-            return 0.0
-        size = float(patch.of_field(self.surrogate.predict(load)[0]).abs().max())
-        return size if math.isfinite(size) else 0.0
-
     def _reported(
-        self, body: HeldBody, load: Load, held: Candidate, request: Request, *, found: bool
+        self, body: HeldBody, load: Load, held: Candidate, request: Request
     ) -> GraspAnswer:
-        """Return a candidate as an answer in SI units; `found` is whether its forces are."""
+        """Return a candidate as an answer in SI units."""
         scene, state = self.scene, held.state
         unit = float(load.young) * scene.force_unit
         assert held.force is not None
@@ -386,21 +360,21 @@ class Gripper:
         force_error, moment_error = body.wrench_errors(held)
         (place,) = RangeCheck.of(self.surrogate, load._replace(force=load.force + nodal))
         place = place._replace(outside=place.outside and not held.known_error < UNRELIABLE)
-        displacement, *fields, words = fields_of(held, place, request, scene)
+        fields = vars(answer_of(held, place, request, scene))
+        missed = held.motion_error * scene.length
+        words = f"motion error {missed:.1e} m; {fields['summary']}"
         words += f"; force within about {relative(force_error)}, moment {relative(moment_error)}"
         if request.spent:
             words += f"; stopped by the budget of {request.budget_ms:g} ms"
-        missed = held.motion_error * scene.length
-        return GraspAnswer(  # type: ignore[misc]  # mypy does not know the length of `fields`
-            displacement.numpy(),
-            *fields,
-            f"motion error {missed:.1e} m; {words}",
+        numpy = {"displacement": fields["displacement"].numpy(), "summary": words}
+        return GraspAnswer(
+            **(fields | numpy),
             force=unit * wrench.force.numpy(),
             moment=unit * scene.length * wrench.moment.numpy(),
             nodal_force=unit * nodal.numpy(),
             motion_error=missed,
             force_error=force_error,
             moment_error=moment_error,
-            forces_found=found,
+            forces_found=held.forces_found,
             stopped=request.spent,
         )

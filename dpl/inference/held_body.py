@@ -1,7 +1,6 @@
 """A body whose patch a gripper holds: predicted forces, correction, equilibrium and errors."""
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,90 +20,81 @@ CORRECTED_WARM = 3e-4  # the same of the frames of a moving hand [-]
 CONTRACTION = 0.5  # ratio of residuals below which a correction contracts [-]
 
 
-def predicted_forces(
-    patch: RigidPatch,
-    goal: Tensor,
-    predict: Callable[[Tensor], Tensor],
-    start: Tensor,
-    *,
-    scale: float = 0.0,
-    tol: float = MOTION_TOL,
-    max_iter: int = MAX_ITER,
-    is_over: Callable[[], bool] = bool,
-) -> tuple[Tensor, Tensor, int, bool]:
-    """Return forces of the gripper under which the predicted patch is displaced by the goal.
-
-    The result is the forces, (m,) [-], the displacement, (N, D) [-], the number of predictions,
-    and whether the gap between the predicted patch and the goal is below the tolerance.
-
-    The forces are unknowns at all held degrees of freedom. Each iteration adds the forces that
-    close the gap between predicted and prescribed displacement in the linear body; Anderson's
-    method extrapolates. The prediction with the smallest gap is the result.
-
-    Forces keep their direction while the body moves. An equilibrium that is stable only as long as
-    the gripper holds the patch, such as a column that it shortens beyond buckling, is not found.
-
-    Source: Anderson (1965), J. ACM 12; Walker, Ni (2011), SIAM J. Numer. Anal. 49 (as a least
-    squares problem of differences).
-
-    Args:
-        patch: The patch.
-        goal: Displacement of the held degrees of freedom, (m,) [-].
-        predict: Function from the forces of the gripper (N, D) [-] to a displacement (N, D) [-].
-        start: Forces to start from, (m,) [-].
-        scale: Size of the motion of the patch without the gripper [-]; errors are relative to it or
-            to the prescribed motion, whichever is larger.
-        tol: Relative error of the motion at which the iterations end [-].
-        max_iter: Largest number of predictions.
-        is_over: Returns True if no further prediction may be made; there is always one.
-    """
-    size = max(scale, float(goal.abs().max()))
-    energy = patch.compliance_factor.mT  # |L^T f| is the energy norm of forces
-    best, nearest = (torch.zeros_like(start), torch.zeros_like(patch.problem.points)), math.inf
-    forces: list[Tensor] = []
-    steps: list[Tensor] = []
-    force = start
-    for count in range(1, max_iter + 1):  # noqa: B007  # the number is returned
-        field = predict(patch.at(force))
-        gap = goal - patch.of_field(field)
-        largest = float(gap.abs().max())
-        found = largest <= tol * size
-        if found or largest < nearest:
-            best, nearest = (force, field), largest
-        if found or not math.isfinite(largest) or is_over():
-            break
-        forces, steps = [*forces[-MEMORY:], force], [*steps[-MEMORY:], patch.stiffness_times(gap)]
-        force = force + steps[-1]
-        if len(steps) > 1:
-            changes = torch.stack(steps).diff(dim=0).mT
-            moves = torch.stack(forces).diff(dim=0).mT
-            mix = torch.linalg.lstsq(energy @ changes, energy @ steps[-1][:, None]).solution
-            force = force - ((moves + changes) @ mix)[:, 0]
-    return *best, count, found
-
-
 @dataclass(frozen=True, eq=False)
 class HeldBody:
-    """A body whose patch is held at its goal.
-
-    Attributes:
-        patch: The patch.
-        goal: Its displacement, (m,) [-].
-        load: Other forces on the body, B = 1, without parameters of the law.
-        newton: Newton's method with the patch as a moved support.
-    """
+    """A body whose patch is held at its goal."""
 
     patch: RigidPatch
-    goal: Tensor
-    load: Load
-    newton: Newton
+    goal: Tensor  # displacement of the patch, (m,) [-]
+    load: Load  # other forces on the body, B = 1, without parameters of the law
+    newton: Newton  # with the patch as a moved support
+
+    def predicted_forces(
+        self,
+        predict: Callable[[Tensor], Tensor],
+        start: Tensor,
+        *,
+        scale: float,
+        tol: float,
+        max_iter: int,
+        is_over: Callable[[], bool],
+    ) -> tuple[Tensor, Tensor, int, bool]:
+        """Return forces of the gripper under which the predicted patch is displaced to the goal.
+
+        The result is the forces, (m,) [-], the displacement, (N, D) [-], the number of predictions,
+        and whether the gap between the predicted patch and the goal is below the tolerance.
+
+        The forces are unknowns at all held degrees of freedom. Each iteration adds the forces that
+        close the gap between predicted and prescribed displacement in the linear body; Anderson's
+        method extrapolates. The prediction with the smallest gap is the result.
+
+        Forces keep their direction while the body moves. An equilibrium that is stable only as long
+        as the gripper holds the patch, such as a column that it shortens beyond buckling, is not
+        found.
+
+        Source: Anderson (1965), J. ACM 12; Walker, Ni (2011), SIAM J. Numer. Anal. 49 (as a least
+        squares problem of differences).
+
+        Args:
+            predict: Function from the forces of the gripper (N, D) [-] to a displacement (N, D).
+            start: Forces to start from, (m,) [-].
+            scale: Size of the motion of the patch without the gripper [-]; errors are relative to
+                it or to the prescribed motion, whichever is larger.
+            tol: Relative error of the motion at which the iterations end [-].
+            max_iter: Largest number of predictions.
+            is_over: Returns True if no further prediction may be made; there is always one.
+        """
+        patch = self.patch
+        size = max(scale, float(self.goal.abs().max()))
+        energy = patch.compliance_factor.mT  # |L^T f| is the energy norm of forces
+        best, nearest = (torch.zeros_like(start), torch.zeros_like(patch.problem.points)), math.inf
+        forces: list[Tensor] = []
+        steps: list[Tensor] = []
+        force = start
+        for count in range(1, max_iter + 1):  # noqa: B007  # the number is returned
+            field = predict(patch.at(force))
+            gap = self.goal - patch.of_field(field)
+            largest = float(gap.abs().max())
+            found = largest <= tol * size
+            if found or largest < nearest:
+                best, nearest = (force, field), largest
+            if found or not math.isfinite(largest) or is_over():
+                break
+            forces = [*forces[-MEMORY:], force]
+            steps = [*steps[-MEMORY:], patch.stiffness_times(gap)]
+            force = force + steps[-1]
+            if len(steps) > 1:
+                changes = torch.stack(steps).diff(dim=0).mT
+                moves = torch.stack(forces).diff(dim=0).mT
+                mix = torch.linalg.lstsq(energy @ changes, energy @ steps[-1][:, None]).solution
+                force = force - ((moves + changes) @ mix)[:, 0]
+        return *best, count, found
 
     def with_errors(self, candidate: Candidate, request: Request) -> Candidate:
-        """Return a candidate with the forces of the gripper and the error of its motion.
+        """Return a candidate with the forces of the gripper and its errors, estimated if in time.
 
-        Its error is estimated if there is time for it. A correction that has contracted shows that
-        the preconditioner is near the inverse of the tangent. The estimate then needs no products
-        with the tangent.
+        A correction that has contracted shows that the preconditioner is near the inverse of the
+        tangent. The estimate then needs no products with the tangent.
         """
         patch, state, u = self.patch, candidate.state, candidate.state.displacement
         evaluation, force = self.newton.problem.evaluate(u), candidate.force
@@ -157,12 +147,8 @@ class HeldBody:
         enough = CORRECTED_WARM if request.warm else CORRECTED
         valid: list[Solution] = []
         error = math.inf
-        clock = time.perf_counter()
-        solver = AndersonSolver(self.newton, max_iter=steps)
-        for state in solver.iterate(self.load, guess=guess[None]):
-            now = time.perf_counter()
-            request.durations.add("step", now - clock)
-            clock = now
+        iterates = AndersonSolver(self.newton, max_iter=steps).iterate(self.load, guess=guess[None])
+        for state in request.durations.each("step", iterates):
             if not bool(state.volume_ratio > 0):
                 break
             valid.append(state)
@@ -178,16 +164,15 @@ class HeldBody:
         best = min(valid, key=lambda one: float(one.residual), default=None)
         return None if best is None else Candidate("corrected", best, error)
 
-    def equilibrium(self, guess: Tensor, request: Request) -> Candidate:
-        """Return the equilibrium by Newton's method from a guess (1, N, D), else from rest.
+    def equilibrium(self, start: Candidate, request: Request) -> Candidate:
+        """Return the equilibrium by Newton's method from a candidate, else from rest.
 
         The budget ends it at the last state.
         """
-        clock = time.perf_counter()
-        for last in Hybrid(lambda load: guess, self.newton).iterate(self.load):
-            now = time.perf_counter()
-            request.durations.add("Newton", now - clock)
-            clock = now
+        hybrid = Hybrid(lambda load: start.state.displacement, self.newton)
+        for last in request.durations.each("Newton", hybrid.iterate(self.load)):
             if not last.converged and request.over("Newton", "errors"):
                 break
-        return Candidate("hybrid" if bool(last.from_guess) else "full Newton", last)
+        method = "hybrid" if bool(last.from_guess) else "full Newton"
+        found = Candidate(method, last, forces_found=start.forces_found)
+        return self.with_errors(found, request)

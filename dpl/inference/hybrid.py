@@ -11,6 +11,7 @@ from dpl.fem import (
     AndersonSolver,
     Load,
     Problem,
+    ReferenceSolver,
     Solution,
     SubspaceNewton,
     evaluate_solution,
@@ -23,18 +24,8 @@ RULES = ("natural_monotonicity", "paper")
 SECOND_CORRECTION = 0.1  # norm, over that of the displacement, that is always allowed [-]
 
 
-class Corrector(Protocol):
+class Corrector(ReferenceSolver, Protocol):
     """A Newton method that can start from a guess."""
-
-    @property
-    def problem(self) -> Problem:
-        """The body."""
-        ...
-
-    @property
-    def tol(self) -> float:
-        """Relative residual below which a solution counts as converged [-]."""
-        ...
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
         """Yield the initial state and the state after each iteration."""
@@ -48,8 +39,7 @@ class Direct:
     Attributes:
         predict: Function from a load to displacements, (B, N, D) [-].
         problem: The body.
-        tol: Relative residual below which the prediction counts as converged [-]; at least 1e-15,
-            below 1.
+        tol: Relative residual below which the prediction counts as converged [-].
     """
 
     predict: Predict
@@ -67,12 +57,7 @@ class Direct:
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """The prediction of a network, corrected by Newton's steps in its modes.
-
-    Attributes:
-        predict: Function from a load to displacements, (B, N, D) [-].
-        newton: Newton's method in the modes.
-    """
+    """The prediction of a network, corrected by the steps of `newton` in its modes."""
 
     predict: Predict
     newton: SubspaceNewton
@@ -134,12 +119,8 @@ class Hybrid:
         """
         guesses = _prediction(self.predict, load)
         member = self._by_paper if self.rule == "paper" else self._by_corrections
-        yield from run_lockstep(
-            [
-                member(single, guess[None])
-                for single, guess in zip(load.unbatch(), guesses, strict=True)
-            ]
-        )
+        pairs = zip(load.unbatch(), guesses.split(1), strict=True)
+        yield from run_lockstep([member(single, guess) for single, guess in pairs])
 
     def _by_paper(self, load: Load, guess: Tensor) -> Iterator[Solution]:
         """Yield the states under one load by the rule of the paper."""
@@ -199,15 +180,10 @@ class Hybrid:
 
 
 def default_hybrid(predict: Predict, scene: Scene, tol: float | None = None) -> Hybrid:
-    """Return the hybrid solver of a scene.
+    """Return the hybrid solver of a scene, whose tolerance it has if `tol` is None.
 
     Anderson iterations precede Newton if the corotated factor of K(0) is a good preconditioner, see
     `Scene.is_compact`.
-
-    Args:
-        predict: Function from a load to displacements, (B, N, D) [-].
-        scene: The scene.
-        tol: Relative residual [-]; None: that of the scene.
     """
     newton = scene.corrector if tol is None else replace(scene.corrector, tol=tol)
     return Hybrid(predict, newton, steps=AndersonSolver(newton) if scene.is_compact else None)
@@ -216,11 +192,8 @@ def default_hybrid(predict: Predict, scene: Scene, tol: float | None = None) -> 
 def prefer_prediction(predicted: Solution, first: Solution) -> bool:
     """Return True if ||R(u_p)|| < ||R(u_1)|| and the prediction u_p inverts no element.
 
-    The result is False for a residual that is NaN.
-
-    Args:
-        predicted: The prediction u_p of one load.
-        first: The state u_1 after one iteration from zero.
+    `predicted` is u_p of one load, `first` u_1 after one iteration from zero. The result is False
+    for a residual that is NaN.
     """
     return bool(predicted.volume_ratio > 0) and bool(predicted.residual < first.residual)
 

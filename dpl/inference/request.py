@@ -3,10 +3,10 @@
 import math
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar
 
 from torch import Tensor
 
@@ -17,6 +17,7 @@ from dpl.fem.solvers.solution import check_tol
 from dpl.inference.arguments import as_number
 from dpl.scene import Scene
 
+T = TypeVar("T")
 EXACT = 1e-12  # error of a motion that counts as met exactly [-]
 SUFFICIENT = 2e-3  # estimated relative error above which predictions are corrected [-]
 FINISH = "finish"  # stage between the last iteration of a call and its answer
@@ -25,45 +26,26 @@ DECAY = 0.9  # of a forecast that prevents its stage, so that one slow call does
 
 
 class Guess(NamedTuple):
-    """A displacement with its known errors.
+    """A displacement with its relative errors, calibrated on held-out loads; infinite: unknown."""
 
-    Attributes:
-        displacement: (1, N, D) [-].
-        error: Its relative error, calibrated on held-out loads [-]; infinite: unknown.
-        error_outside: The relative error that steps in the modes leave, likewise [-].
-    """
-
-    displacement: Tensor
-    error: float = math.inf
-    error_outside: float = math.inf
+    displacement: Tensor  # (1, N, D) [-]
+    error: float = math.inf  # [-]
+    error_outside: float = math.inf  # that which steps in the modes leave [-]
 
 
 class Candidate(NamedTuple):
-    """A solution with its method and its errors.
+    """A solution with its method and its errors."""
 
-    Attributes:
-        method: As of `Answer`.
-        state: The solution.
-        error: Its estimated relative error [-]; None: not computed.
-        error_in_modes: Newton's correction in the modes of the model, relative to it [-]; 0 without
-            modes.
-        error_outside: Its estimated relative error outside of the modes [-]; infinite: unknown.
-        correction: The correction behind its estimated error, (1, N, D) [-]; None: not computed.
-        evaluation: Internal force and min det F at its displacement, if known.
-        motion_error: Largest distance of a held node from its prescribed place [-].
-        force: Forces of a gripper at held degrees of freedom, (m,) [-]; None: those that balance
-            the stresses.
-    """
-
-    method: str
+    method: str  # as of `Answer`
     state: Solution
-    error: float | None = None
-    error_in_modes: float = 0.0
-    error_outside: float = math.inf
-    correction: Tensor | None = None
-    evaluation: Evaluation | None = None
-    motion_error: float = 0.0
-    force: Tensor | None = None
+    error: float | None = None  # estimated relative error [-]; None: not computed
+    error_in_modes: float = 0.0  # relative correction in the modes of the model [-]; 0 without
+    error_outside: float = math.inf  # relative error outside of the modes [-]; infinite: unknown
+    correction: Tensor | None = None  # behind the estimated error, (1, N, D) [-]
+    evaluation: Evaluation | None = None  # internal force and min det F, if known
+    motion_error: float = 0.0  # largest distance of a held node from its prescribed place [-]
+    force: Tensor | None = None  # of a gripper, (m,) [-]; None: balances the stresses
+    forces_found: bool = False  # as of `GraspAnswer`
 
     @classmethod
     def evaluated(
@@ -111,6 +93,15 @@ class Durations:
         """Add a time of a stage [s]."""
         self._recent[stage].append(seconds)
 
+    def each(self, stage: str, items: Iterable[T]) -> Iterator[T]:
+        """Yield items, and add the time from each one to the next."""
+        clock = time.perf_counter()
+        for item in items:
+            now = time.perf_counter()
+            self.add(stage, now - clock)
+            clock = now
+            yield item
+
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
         """Add the time of a block."""
@@ -126,35 +117,23 @@ class Durations:
 
 @dataclass
 class Request:
-    """Tolerances and budget of a call.
+    """Tolerances and budget of a call."""
 
-    Attributes:
-        tol: Relative residual of the result [-]; None: not requested.
-        budget_ms: Wall time of each load [ms]; None: no limit.
-        error: Estimated relative error of the result [-]; None: not requested.
-        warm: Whether the last displacement is a guess too.
-        begin: Time at which the computation began [s].
-        products: Largest number of products with the tangent in an estimated error.
-        durations: Times of the stages of this call and of earlier ones.
-        spent: True if a computation ended because of the budget.
-    """
-
-    tol: float | None
-    budget_ms: float | None
-    error: float | None
-    warm: bool
-    begin: float = 0.0
-    products: int = PRODUCTS
-    durations: Durations = field(default_factory=Durations)
-    spent: bool = False
+    tol: float | None  # relative residual of the result [-]; None: not requested
+    budget_ms: float | None  # wall time of each load [ms]; None: no limit
+    error: float | None  # estimated relative error of the result [-]; None: not requested
+    warm: bool  # the last displacement is a guess too
+    begin: float = 0.0  # time at which the computation began [s]
+    products: int = PRODUCTS  # most products with the tangent in an estimated error
+    durations: Durations = field(default_factory=Durations)  # of this call and of earlier ones
+    spent: bool = False  # a computation ended because of the budget
 
     @classmethod
-    def checked(cls, tol: Any, budget_ms: Any, error: Any, *, warm: bool) -> Self:
-        """Return the arguments of a call as numbers.
-
-        Raises:
-            ValueError: An argument is not one number, or out of range.
-        """
+    def checked(
+        cls, tol: Any, budget_ms: Any, error: Any, durations: Durations, *, warm: bool
+    ) -> Self:
+        """Return the arguments of a call that begins, as numbers."""
+        begin = time.perf_counter()
         tol, budget_ms = as_number("tol", tol), as_number("budget_ms", budget_ms)
         error = as_number("error", error)
         if tol is not None:
@@ -163,7 +142,7 @@ class Request:
             raise ValueError(f"error = {error} must be above 0")
         if budget_ms is not None and not 0 < budget_ms < math.inf:
             raise ValueError(f"budget_ms = {budget_ms} must be a number above 0")
-        return cls(tol, budget_ms, error, warm)
+        return cls(tol, budget_ms, error, warm, begin, durations=durations)
 
     @property
     def sufficient_error(self) -> float:
@@ -174,11 +153,6 @@ class Request:
     def is_more_than_prediction(self) -> bool:
         """True if other methods may follow the prediction."""
         return (self.tol, self.budget_ms, self.error) != (None, None, None)
-
-    @property
-    def skips_poor_predictions(self) -> bool:
-        """True if the result meets tolerances in any time, so that a prediction is a start only."""
-        return self.budget_ms is None and (self.tol, self.error) != (None, None)
 
     @property
     def is_for_error(self) -> bool:
@@ -195,12 +169,9 @@ class Request:
         return tol if self.error is None else min(tol, scene.solver.tol)
 
     def is_met(self, candidate: Candidate) -> bool:
-        """Return True if a solution meets all tolerances of the call, or is the best possible.
-
-        The latter has converged to `iteration_tol`, or rounding allows no smaller residual.
-        """
+        """Return True if a solution meets all tolerances of the call, or is the best possible."""
         state = candidate.state
-        if bool(state.converged):
+        if bool(state.converged):  # to `iteration_tol`, or rounding allows no smaller residual
             return True
         if self.tol is None and self.error is None:
             return False
@@ -210,8 +181,7 @@ class Request:
     def rank(self, candidate: Candidate) -> tuple[bool, bool, float]:
         """Return the key by which solutions are sorted; the smallest is best.
 
-        It is whether they are not converged, whether an element is inverted, and the estimated
-        error if that has a tolerance or nothing has, else the residual.
+        The estimated error decides if it has a tolerance or nothing has, else the residual.
         """
         state = candidate.state
         by_error = self.error is not None or self.is_for_error

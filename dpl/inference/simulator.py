@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -19,19 +19,17 @@ from dpl.fem import (
     evaluate_solution,
 )
 from dpl.fem.solvers.error_estimate import MANY_PRODUCTS, PRODUCTS
-from dpl.inference.answer import Answer, answer_of, fields_of
+from dpl.inference.answer import Answer, RangeCheck, answer_of, stacked
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.grasp import Gripper
 from dpl.inference.hybrid import default_hybrid
 from dpl.inference.request import FINISH, Candidate, Durations, Guess, Request
-from dpl.inference.training_range import RangeCheck
 from dpl.models.unrolled.correction import MAX_STEPS
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import TrainedSurrogate
 
 ERROR = 1e-3  # estimated relative error in the modes at which the steps end [-]
-POOR_STREAM = 9_003  # of the loads by which the predictions are judged
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
 MAX_RESIDUAL = 1.0  # above it the error outside of the modes is not that of the training [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
@@ -61,16 +59,10 @@ class Simulator:
         newton: SubspaceNewton | None = None,
         steps: int = MAX_STEPS,
     ) -> None:
-        """Store the surrogate and build the corrector of its scene.
+        """Store a surrogate on the CPU and build the corrector of its scene.
 
-        Args:
-            surrogate: A trained surrogate on the CPU.
-            newton: Newton's method in the modes of the model; None: that with which the model comes
-                (`HasCorrection`).
-            steps: Largest number of steps, see the attributes; 0: predictions are not corrected.
-
-        Raises:
-            ValueError: `steps` is negative.
+        Without `newton` it is that with which the model comes (`HasCorrection`). With `steps=0`
+        predictions are not corrected.
         """
         if steps < 0:
             raise ValueError(f"steps = {steps} must be 0 or more")
@@ -126,19 +118,14 @@ class Simulator:
             ValueError: An argument has a wrong shape, contains values that are no real numbers
                 (booleans, text, complex numbers, masked entries) or not finite, or is out of range.
         """
-        begin = time.perf_counter()
+        request = Request.checked(tol, budget_ms, error, self._durations, warm=warm)
         given = as_numbers("force", force)
         load = as_load(self.scene, given, young, parameters)
-        request = replace(
-            Request.checked(tol, budget_ms, error, warm=warm), durations=self._durations
-        )
         with one_thread(), torch.inference_mode():
             places = RangeCheck.of(self.surrogate, load)
-            guesses: Sequence[Guess | None] = [None] * len(load.force)
-            if not (request.skips_poor_predictions and self._is_poor):
-                guesses = self._guesses(load, places)
-            shared = (time.perf_counter() - begin) / len(load.force)
-            rows = []
+            guesses = self._guesses(load, places)
+            shared = (time.perf_counter() - request.begin) / len(load.force)
+            answers = []
             for single, guess, place in zip(load.unbatch(), guesses, places, strict=True):
                 begin = time.perf_counter() - shared
                 own = replace(request, begin=begin, products=self._products(place, request))
@@ -148,8 +135,12 @@ class Simulator:
                     if stability:
                         best = best._replace(state=self._with_stability(single, best.state))
                     self._before = single.parameters, best.state.displacement
-                    rows.append(fields_of(best, place, own, self.scene))
-        return answer_of(rows, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
+                    answers.append(answer_of(best, place, own, self.scene))
+        numpy = not isinstance(force, Tensor)
+        if given.ndim == 3:
+            return stacked(answers, numpy=numpy)
+        u = answers[0].displacement  # a tensor of inference mode, which an ordinary one replaces
+        return replace(answers[0], displacement=u.numpy() if numpy else u.clone())
 
     def prediction_error(self, load: Load, prediction: Tensor) -> float:
         """Return the estimated relative error that a call states for a prediction (1, N, D) [-].
@@ -168,7 +159,10 @@ class Simulator:
 
     @cached_property
     def grasp(self) -> Gripper:
-        """The gripper of the body, called as `sim.grasp(region, translation, rotation)`."""
+        """The gripper of the body, called as `sim.grasp(region, translation, rotation)`.
+
+        `dataclasses.replace(sim.grasp, warm=True)` is a moving hand, `sliding=True` a flat plate.
+        """
         return Gripper(self.surrogate, steps=self.steps)
 
     def _guesses(self, load: Load, places: Sequence[RangeCheck]) -> list[Guess]:
@@ -177,18 +171,10 @@ class Simulator:
         rows = zip(predictions.split(1), errors.tolist(), places, strict=True)
         return [Guess(u, *own) if place.inside else Guess(u) for u, own, place in rows]
 
-    def _solve(
-        self, load: Load, guess: Guess | None, place: RangeCheck, request: Request
-    ) -> Candidate:
+    def _solve(self, load: Load, guess: Guess, place: RangeCheck, request: Request) -> Candidate:
         """Return the first solution that meets the tolerances, else the best one.
 
         Its error is estimated if that decides.
-
-        Args:
-            load: The load, B = 1.
-            guess: The prediction of the network; None if it is not tried.
-            place: Position of the load relative to the training range.
-            request: Options of the call.
         """
         scene, tol = self.scene, request.residual_tol(self.scene)
         if not load.force.any() and not scene.problem.is_loaded_at_rest:
@@ -213,8 +199,8 @@ class Simulator:
     def _products(self, place: RangeCheck, request: Request) -> int:
         """Return the products with the tangent in an estimate, which softening needs.
 
-        Displacements of a compact body in a range without softening are estimated without products,
-        and predictions of a thin one, since many products would take longer than the prediction.
+        In a range without softening, compact bodies need none. Predictions of thin ones have none,
+        since many products would take longer than the prediction.
         """
         is_compact = self.scene.is_compact
         is_usual = place.inside and not self.scene.is_softened
@@ -225,13 +211,13 @@ class Simulator:
     def _with_error(self, load: Load, candidate: Candidate, request: Request) -> Candidate:
         """Return a solution with its estimated error.
 
-        The error in the modes and the known one outside of them are the estimate if their sum is
-        sufficient, or known and there is no time for another one. Otherwise it is the larger one of
-        the error in the modes and of `estimate_error`.
+        It is the error in the modes plus the known one outside of them if this sum is sufficient,
+        or there is no time for another one, else the larger one of the error in the modes and of
+        `estimate_error`.
         """
-        known = candidate.error_in_modes + candidate.error_outside
         if candidate.error is not None:
             return candidate
+        known = candidate.error_in_modes + candidate.error_outside
         is_known = math.isfinite(known) and request.over("estimate")
         if known <= request.sufficient_error or is_known:
             return candidate._replace(error=known)
@@ -247,43 +233,44 @@ class Simulator:
         return candidate._replace(state=state, error=error, correction=found.correction)
 
     def _candidates(
-        self, load: Load, guess: Guess | None, place: RangeCheck, request: Request
+        self, load: Load, guess: Guess, place: RangeCheck, request: Request
     ) -> Iterator[tuple[Candidate, str]]:
         """Yield the solutions of the methods, the cheapest first, and what would follow.
 
         The hybrid continues from the prediction, or with `warm` from the last displacement, if that
         is near equilibrium. Otherwise Newton's method starts from rest, since its iterates from far
-        seldom lead to a solution. See `_solve`; stages that follow are those of `Durations`.
+        seldom lead to a solution.
         """
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
-        starts, durations = [], request.durations
-        if guess is not None:
-            for first in self._predictions(load, guess, request):
-                yield first, "start"  # the last one is the best
-            if not request.is_more_than_prediction:
-                return
-            starts.append(first)
+        for first in self._predictions(load, guess, request):
+            yield first, "start"  # the last one is the best
+        if not request.is_more_than_prediction:
+            return
+        starts, durations = [first], request.durations
         with durations.timed("start"):
             if request.warm and self._before and torch.equal(self._before[0], load.parameters):
                 starts.append(Candidate.evaluated("last", problem, self._before[1], load, tol))
             distances = [self._distance(load, one) for one in starts]
-        start = None
-        if (least := min(distances, default=math.inf)) <= FAR:
-            start = starts[distances.index(least)].state.displacement
+        nearest = starts[distances.index(min(distances))]
+        start = nearest.state.displacement if min(distances) <= FAR else None
         stage = "Newton" if start is None or not self.scene.is_compact else "iteration"
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
             linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
             yield Candidate.evaluated("linear", problem, linear, load, tol), stage
-        elif starts and request.over(stage):
+        elif request.over(stage):
             return
 
-        def newton_is_over() -> bool:
+        def newton_is_over() -> bool:  # called after the iterations without tangents
             nonlocal stage
             stage = "Newton"
             return request.over(stage)
 
+        states = replace(self.scene.corrector, tol=tol).iterate(load)
+        if start is not None:
+            hybrid = default_hybrid(lambda load: start, self.scene, tol)
+            states = replace(hybrid, is_over=newton_is_over).iterate(load)
         clock = time.perf_counter()
-        for state in self._iterates(load, start, tol, newton_is_over):
+        for state in states:
             if int(state.iterations):
                 now = time.perf_counter()
                 durations.add(stage, now - clock)
@@ -291,33 +278,6 @@ class Simulator:
             elif not state.converged:  # the initial state, which has been evaluated
                 continue
             yield Candidate("hybrid" if state.from_guess else "full Newton", state), stage
-
-    def _iterates(
-        self, load: Load, start: Tensor | None, tol: float, is_over: Callable[[], bool]
-    ) -> Iterator[Solution]:
-        """Yield the iterates of the hybrid from a start, of Newton's method without one.
-
-        `is_over` returns True if Newton's method may not follow Anderson's.
-        """
-        if start is None:
-            return replace(self.scene.corrector, tol=tol).iterate(load)
-        hybrid = default_hybrid(lambda load: start, self.scene, tol)
-        return replace(hybrid, is_over=is_over).iterate(load)
-
-    @cached_property
-    def _is_poor(self) -> bool:
-        """True if predictions of a few random loads are far from equilibrium.
-
-        Newton's method from rest is faster than it is to try such predictions.
-        """
-        problem, tol = self.scene.problem, self.scene.solver.tol
-        loads = self.scene.loads.sample((0, POOR_STREAM), range(3)).unbatch()
-        predictions = map(self.surrogate.predict, loads)
-        found = [
-            Candidate.evaluated("prediction", problem, u, load, tol)
-            for load, u in zip(loads, predictions, strict=True)
-        ]
-        return not any(self._distance(*pair) <= FAR for pair in zip(loads, found, strict=True))
 
     def _distance(self, load: Load, candidate: Candidate) -> float:
         """Return the estimated relative error of a start [-]; one up to `FAR` may be rough."""
@@ -389,8 +349,5 @@ class Simulator:
             return state
         newton = self.scene.newton.with_parameters(load.parameters)
         pivots = newton.stability(state.displacement)
-        status = Status.UNSTABLE if pivots > 0 else Status.CONVERGED
-        return state._replace(
-            negative_pivots=torch.full_like(state.negative_pivots, pivots),
-            status=torch.full_like(state.status, int(status)),
-        )
+        status = int(Status.UNSTABLE if pivots > 0 else Status.CONVERGED)
+        return state._replace(negative_pivots=torch.tensor([pivots]), status=torch.tensor([status]))

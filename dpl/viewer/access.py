@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import websockets.asyncio.server
-from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 RequestHandler = Callable[[Any, Request], Response | None]
@@ -52,10 +51,7 @@ class RateLimitedHandler(logging.Handler):
 
     A browser decides how often requests fail and can influence the text of errors. Lines within
     `MIN_INTERVAL` of the last one are counted and not printed. Lines are shortened and contain no
-    control characters.
-
-    Attributes:
-        logger: A logger with this handler only.
+    control characters. `logger` has this handler only.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -123,11 +119,7 @@ class AccessPolicy:
 
     @classmethod
     def bind(cls, host: str, port: int, allowed_hosts: Sequence[str] = ()) -> "AccessPolicy":
-        """Return the policy of a socket that is bound to a host and a port; port 0: any free one.
-
-        Raises:
-            OSError: The port is in use, or the host does not exist.
-        """
+        """Return the policy of a socket bound to a host and a port; port 0: any free one."""
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with contextlib.ExitStack() as on_error:
             bound = on_error.enter_context(socket.socket(family, socket.SOCK_STREAM))
@@ -172,15 +164,16 @@ class AccessPolicy:
         """Return a request handler that passes allowed requests on, without the token."""
 
         def handle_allowed(connection: Any, request: Request) -> Response | None:
-            denied = self.denial_reason(request)
-            if denied is not None:
-                return _text_response(*denied)
+            if denied := self.denial_reason(request):
+                return connection.respond(*denied)
             path = request.path.removeprefix(f"/{self.token}")
             inner = Request(path if path.startswith("/") else "/" + path, request.headers)
             try:
                 response = handle(connection, inner)
             except (LookupError, OSError, ValueError):  # a repeated header or a path too long
-                return _text_response(http.HTTPStatus.BAD_REQUEST, "The request is malformed.\n")
+                return connection.respond(
+                    http.HTTPStatus.BAD_REQUEST, "The request is malformed.\n"
+                )
             if response is not None:
                 sockets = f"ws://{request.headers['Host']}"
                 for name, value in HEADERS.items():
@@ -206,21 +199,12 @@ class AccessPolicy:
         return True
 
 
-def _text_response(status: http.HTTPStatus, text: str) -> Response:
-    body = text.encode()
-    headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
-    return Response(status.value, status.phrase, headers, body)
-
-
 @contextlib.contextmanager
 def serve_with(policy: AccessPolicy) -> Iterator[None]:
     """Apply a policy to the websockets server that is started in this context.
 
     viser calls `websockets.asyncio.server.serve` and has no option for access control, so that this
-    function is replaced while viser starts.
-
-    Raises:
-        RuntimeError: No server was started by it.
+    function is replaced while viser starts. An error is raised if it was not called.
     """
     original, started = websockets.asyncio.server.serve, False
 

@@ -21,15 +21,10 @@ MARGINS = (0.03, 0.03, 0.03, 0.03)  # empty margins of an image: left, right, be
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Perspective camera with the vertical angle of view `FIELD_OF_VIEW`.
+    """Perspective camera with the vertical angle of view `FIELD_OF_VIEW`."""
 
-    Attributes:
-        position: Position over L, (3,).
-        look_at: Point at the centre of the image over L, (3,).
-    """
-
-    position: Floats
-    look_at: Floats
+    position: Floats  # over L, (3,)
+    look_at: Floats  # point at the centre of the image over L, (3,)
 
     @classmethod
     def fit(
@@ -40,16 +35,11 @@ class Camera:
         aspect: float = 1.2,
         margins: tuple[float, float, float, float] = MARGINS,
     ) -> "Camera":
-        """Return the nearest camera whose image contains all points, in the usual direction.
+        """Return the nearest camera whose image contains all points (n, 3) over L.
 
-        A point at depth z from the camera is in the image if it lies within t z of the axis. For
-        each side of the image, the point that is farthest outside determines a line of positions.
-
-        Args:
-            points: Points over L, (n, 3).
-            planar: Look from above, for bodies in 2D.
-            aspect: Width over height of the image.
-            margins: Empty margins left, right, below and above, over width or height [-].
+        It looks from above if `planar`; `aspect` and `margins` are those of the image. A point at
+        depth z from the camera is in the image if it lies within t z of the axis. For each side of
+        the image, the point that is farthest outside determines a line of positions.
         """
         axes = _axes(-np.array(VIEW_2D if planar else VIEW_3D))
         x, y, z = axes @ points.T
@@ -83,20 +73,12 @@ def _axes(forward: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Places of the body and of a second body that is compared with it.
+    """Places over L of the body and of a second body that is compared with it."""
 
-    Attributes:
-        planar: True for a body in 2D.
-        points: Points of the body at rest and under the largest loads, with arrows and label, over
-            L, (n, 3).
-        label: Position of the label above them over L, (3,).
-        offset: Position of the second body relative to the first over L, (3,).
-    """
-
-    planar: bool
-    points: Floats
-    label: Floats
-    offset: Floats
+    planar: bool  # the body is in 2D
+    points: Floats  # of the body at rest and under the largest loads, arrows and label, (n, 3)
+    label: Floats  # position of the label above them, (3,)
+    offset: Floats  # position of the second body relative to the first, (3,)
 
     @classmethod
     def of(cls, body: Body, node: int, radius: float) -> "Placement":
@@ -121,11 +103,6 @@ class Placement:
         ]
         distances = [np.linalg.norm(camera.position - camera.look_at) for camera in cameras]
         return cls(planar, points, label, offsets[int(np.argmin(distances))])
-
-    @property
-    def ground(self) -> float:
-        """Height of the ground over L, below all shapes."""
-        return float(self.points[:, 2].min()) - (0.01 if self.planar else 0.02)
 
     def camera(
         self, *, aspect: float = 1.2, both: bool = False, shown: Floats | None = None

@@ -158,11 +158,8 @@ class Controls:
     def show_frame(self, frame: Frame, top: float, node: int, below: str) -> None:
         """Update readings, details and, with `follows_frame`, the amplitude.
 
-        Args:
-            frame: Frame of a result of the simulator.
-            top: Upper end of the colours; 0: there is no legend.
-            node: Node whose displacement is shown.
-            below: HTML below the legend.
+        `top` is the upper end of the colours, 0 without a legend. The displacement is that of
+        `node`. `below` is HTML below the legend.
         """
         scene = self._body.scene
         amplitude = frame.request.amplitude(frame.answer, scene)
@@ -174,10 +171,9 @@ class Controls:
 
 
 def result_tables(frame: Frame, node: int, amplitude: float) -> tuple[str, str]:
-    """Return the table of a result of the simulator, and that of its details.
+    """Return the tables of a result of the simulator and of its details, see `show_frame`.
 
-    `node` is the node whose displacement is shown, the centre of the patch; `amplitude` is the size
-    of the load over the largest of the training.
+    `amplitude` is the size of the load over the largest of the training.
     """
     grasp, answer = frame.grasp, frame.answer
     error, outside = float(answer.error), answer.out_of_distribution
@@ -210,38 +206,31 @@ def result_tables(frame: Frame, node: int, amplitude: float) -> tuple[str, str]:
         *others,
     ]
     summary = f'<div style="line-height:1.35">{html.escape(answer.summary)}</div>'
-    return table(*rows), BOX.format(_rows(*details) + summary)
+    return table(*rows), table(*details, below=summary)
 
 
 def _size(vector: ArrayLike, unit: str) -> str:
     return engineering(float(np.linalg.norm(np.asarray(vector))), unit)
 
 
-def table(*rows: tuple[str, str, str]) -> str:
-    """Return a table of rows: name, value and style of the value."""
-    return BOX.format(_rows(*rows))
-
-
-def _rows(*rows: tuple[str, str, str]) -> str:
-    return "".join(
-        ROW.format(html.escape(name), style, html.escape(value)) for name, value, style in rows
-    )
+def table(*rows: tuple[str, str, str], above: str = "", below: str = "") -> str:
+    """Return a table of rows (name, value and style of the value) between other HTML."""
+    lines = [ROW.format(html.escape(name), look, html.escape(text)) for name, text, look in rows]
+    return BOX.format("".join([above, *lines, below]))
 
 
 def problem_of(frame: Frame, *, has_budget: bool = False) -> str:
-    """Return why a frame cannot be used, in one line; empty if it can.
-
-    With a budget the user has chosen the time after which a grasp stops, so that this is no reason.
-    """
+    """Return why a frame cannot be used, in one line; empty if it can."""
     if not frame.answer.volume_ratio > 0:
         return "Not valid: an element is inverted. Move the hand back."
-    grasp = frame.grasp
-    if grasp is not None and grasp.stopped and not has_budget:
+    if (grasp := frame.grasp) is None:
+        return ""
+    if grasp.stopped and not has_budget:  # a budget is the time that the user has chosen
         return (
             f"Not solved: stopped after {grasp.milliseconds / 1e3:.1f} s with an estimated error "
             f"of {relative(grasp.error)}. Move the hand back."
         )
-    if grasp is None or grasp.error < UNRELIABLE:
+    if grasp.error < UNRELIABLE:
         return ""
     apart = engineering(grasp.motion_error, "m")
     return (
@@ -274,12 +263,12 @@ def legend(frame: Frame, top: float) -> str:
     )
     ticks = "".join(f"<span>{engineering(top * k / 4, unit)}</span>" for k in range(5))
     span = f"{engineering(low, unit)} to {engineering(high, unit)}"
-    return BOX.format(
+    return table(("on the surface", span, ""), above=(
         f'<div style="margin-bottom:4px"><b>{html.escape(frame.quantity)}</b></div>'
         f'<div style="display:flex;height:14px;border-radius:3px;overflow:hidden">{cells}</div>'
         f'<div style="display:flex;justify-content:space-between;font-size:11.5px;opacity:.75">'
-        f"{ticks}</div>" + _rows(("on the surface", span, ""))
-    )
+        f"{ticks}</div>"
+    ))  # fmt: skip
 
 
 def message(text: str, colour: str = WARNING) -> str:
@@ -291,8 +280,8 @@ def message(text: str, colour: str = WARNING) -> str:
 def round_step(low: float, high: float, *, steps: int = 200) -> float:
     """Return a power of ten that divides an interval into at least `steps` steps.
 
-    The step is at least 1e-4 of the largest power of ten in the interval, so that values with this
-    step have at most five digits. Equal ends, as of a fixed value, count as an interval from zero.
+    The step is at least 1e-4 of the largest power of ten in it, so that values have at most five
+    digits. Equal ends, as of a fixed value, count as an interval from zero.
     """
     step = 10.0 ** math.floor(math.log10((high - low or abs(high)) / steps))
     return max(step, 10.0 ** (math.floor(math.log10(max(abs(low), abs(high)))) - 4))

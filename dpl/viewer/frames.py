@@ -25,19 +25,12 @@ BALANCED = 1e-6  # total force over the sum of nodal forces below which there is
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """Method and quantity of a frame.
+    """Method and quantity of a frame."""
 
-    Attributes:
-        quantity: Quantity that colours show, a key of `QUANTITIES`.
-        tol: Relative residual to reach [-]; None: the prediction, corrected in the modes.
-        budget_ms: Largest wall time [ms]; None: no limit.
-        show_newton: Also show the iterates of Newton from zero displacement.
-    """
-
-    quantity: str = "displacement"
-    tol: float | None = None
-    budget_ms: float | None = None
-    show_newton: bool = False
+    quantity: str = "displacement"  # that colours show, a key of `QUANTITIES`
+    tol: float | None = None  # relative residual to reach [-]; None: the model alone
+    budget_ms: float | None = None  # largest wall time [ms]; None: no limit
+    show_newton: bool = False  # also show the iterates of Newton from zero displacement
 
     def __post_init__(self) -> None:
         if self.quantity not in QUANTITIES:
@@ -45,25 +38,15 @@ class ViewSettings:
 
 
 class Frame(NamedTuple):
-    """A displacement and the values that are shown.
-
-    Attributes:
-        request: The load or the grasp.
-        load: The load on the body; of a grasp, with the forces of the gripper.
-        displacement: (N, D) [m].
-        points: Deformed surface over L, (S, 3) [-].
-        values: Values of the quantity on the surface, (S,), in the unit of the quantity.
-        quantity: Key of `QUANTITIES`.
-        answer: Result of the simulator, or a `Solution` of Newton.
-    """
+    """A displacement and the values that are shown."""
 
     request: LoadRequest
-    load: LoadRequest
-    displacement: Tensor
-    points: Floats
-    values: Floats
-    quantity: str
-    answer: Any
+    load: LoadRequest  # on the body; of a grasp, with the forces of the gripper
+    displacement: Tensor  # (N, D) [m]
+    points: Floats  # deformed surface over L, (S, 3) [-]
+    values: Floats  # of the quantity on the surface, (S,), in its unit
+    quantity: str  # key of `QUANTITIES`
+    answer: Any  # of the simulator, or a `Solution` of Newton
 
     @property
     def grasp(self) -> GraspAnswer | None:
@@ -121,9 +104,8 @@ class Body:
         self, nodes: Tensor, translation: Tensor, rotation: Tensor, *, sliding: bool = False
     ) -> GraspRequest:
         """Return the request of a grasp; see `GraspRequest` for the arguments."""
-        rest = self.zero_load()
-        motion = translation, rotation, sliding
-        return GraspRequest(rest.force, rest.young, rest.parameters, nodes, *motion)
+        return GraspRequest(**vars(self.zero_load()), nodes=nodes, translation=translation,
+                            rotation=rotation, sliding=sliding)  # fmt: skip
 
     def sample(self, index: int) -> LoadRequest:
         """Return a random load of the training distribution."""
@@ -167,17 +149,15 @@ class Body:
         reference: Tensor | float,
     ) -> Frame:
         """Return the frame of displacements (N, D) [m]; values are relative to `reference`."""
-        u = displacement / self.scene.length
-        if quantity == STRESS and bool(displacement.any()):
+        u, surface = displacement / self.scene.length, self.surface
+        values = (displacement - reference).norm(dim=1).numpy()[surface.nodes]
+        if quantity == STRESS and bool(displacement.any()):  # at rest it is zero up to rounding
             with torch.inference_mode():
-                stress = self.surface.von_mises(u, load.dimensionless(self.scene).parameters)
+                stress = surface.von_mises(u, load.dimensionless(self.scene).parameters)
             values = load.young * stress
-        elif quantity == STRESS:  # at rest it is zero up to rounding
-            values = np.zeros(len(self.surface.nodes))
-        else:
-            values = (displacement - reference).norm(dim=1).numpy()[self.surface.nodes]
-        points = self.surface.deformed_points(u)
-        return Frame(request, load, displacement, points, values, quantity, answer)
+        return Frame(
+            request, load, displacement, surface.deformed_points(u), values, quantity, answer
+        )
 
     def arrow_ends(self, frame: Frame) -> Floats:
         """Return start and end of the arrow over L, (2, 3); (0, 3) if the total force is zero.

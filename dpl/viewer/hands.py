@@ -63,18 +63,15 @@ class PullingHand(_Hand):
 class GraspingHand(_Hand):
     """Converts drags and sliders to rigid motions of a patch, which it holds until `release`."""
 
-    def __init__(self, body: Body, controls: Controls) -> None:
-        """Store the body and the controls of the patch."""
-        super().__init__(body, controls)
-        self._held: int | None = None  # node at the centre of the held patch
-        self._translation = self._start
+    _held: int | None = None  # node at the centre of the held patch
+    _translation: Tensor
 
     def take(self, node: int, frame: Frame) -> int:
         """Hold the patch of the node; a drag within the held patch keeps it."""
         if self._held is None or not self._patch(self._held).node_mask[node]:
-            self._grip(node, frame)
+            self._held = self._grip(node, frame)
         self._start = self._translation
-        return node if self._held is None else self._held
+        return self._held
 
     def move(self, motion: Tensor) -> MakeRequest:
         """Return the grasp whose translation is that at `take` plus the motion."""
@@ -84,7 +81,7 @@ class GraspingHand(_Hand):
     def hold(self, node: int, frame: Frame | None) -> MakeRequest:
         """Return the grasp of the patch of a node, rotated by the angle of the slider."""
         if node != self._held:
-            self._grip(node, frame)
+            self._held = self._grip(node, frame)
         return self._request()
 
     def release(self) -> None:
@@ -96,13 +93,14 @@ class GraspingHand(_Hand):
         patch = self._patch(node)
         return patch.sliding_nodes if self._controls.sliding.value else patch.held_nodes
 
-    def _grip(self, node: int, frame: Frame | None) -> None:
-        """Hold the patch of a node where a frame shows it, without a rotation."""
+    def _grip(self, node: int, frame: Frame | None) -> int:
+        """Hold the patch of a node where a frame shows it, without a rotation; return the node."""
         held = self.marked_nodes(node)
-        self._translation = torch.zeros_like(self._translation)
+        self._translation = torch.zeros_like(self._start)
         if frame is not None and held.any():
             self._translation = frame.displacement[held].mean(dim=0) / self._body.scene.length
-        self._held, self._controls.angle.value = node, 0.0
+        self._controls.angle.value = 0.0
+        return node
 
     def _request(self) -> MakeRequest:
         """Return the request of the held patch with the rotation of the controls."""

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import viser
+from torch import Tensor
 
 from dpl.viewer.camera import FIELD_OF_VIEW, Placement
 from dpl.viewer.frames import Body, Frame
@@ -58,20 +59,16 @@ def add_environment(server: viser.ViserServer, placement: Placement, rest: Float
         scene.add_light_directional(
             name, intensity=intensity, position=position, cast_shadow=shadow
         )
-    position, opacity = (*middle[:2], placement.ground), 0.0 if placement.planar else 0.6
+    gap, opacity = (0.01, 0.0) if placement.planar else (0.02, 0.6)  # below all shapes
+    position = (*middle[:2], placement.points[:, 2].min() - gap)
     scene.add_grid("/ground", plane_opacity=opacity, position=position, **GROUND)
 
 
 class BodyNode:
-    """One body in the browser: a mesh per colour band, edges and supports.
-
-    Attributes:
-        frame: The frame, which has position and visibility.
-        label: Name of the body, above it.
-    """
+    """One body in the browser: a mesh per colour band, edges and supports."""
 
     def __init__(self, server: LocalServer, root: str, body: Body, name: str) -> None:
-        """Add the nodes to the scene below a frame `root`, with a name for the label."""
+        """Add the nodes to the scene below `frame`, called `root`, and a label with the name."""
         self._server, self._surface, scene = server, body.surface, server.scene
         self.frame = scene.add_frame(root, show_axes=False)
         empty, line = (np.zeros((3, 3)), np.array([[0, 1, 2]])), np.zeros((1, 2, 3))
@@ -88,19 +85,13 @@ class BodyNode:
         )
 
     def show(self, frame: Frame, top: float, *, edges: bool) -> None:
-        """Show a frame.
-
-        Args:
-            frame: The frame.
-            top: Upper end of the colour scale; 0: a neutral colour.
-            edges: Show the edges of all facets, in addition to feature edges.
-        """
+        """Show a frame, with `edges` those of all facets too; see `band_colours` for `top`."""
         surface, points = self._surface, np.nan_to_num(frame.points)
         supports = surface.supports(points).reshape(-1, 3)
         soups = [*colour_bands(surface, frame, top), supports]
         colours = [*band_colours(frame.quantity, top).tolist(), SUPPORT_COLOUR]
         lifted = points + LIFT * vertex_normals(points, surface.triangles)
-        moved = float(np.abs(points - surface.undeformed).max()) > OUTLINE_DISTANCE
+        moved = np.abs(points - surface.undeformed).max() > OUTLINE_DISTANCE
         ends_of_lines = (
             lifted[surface.feature_edges],
             lifted[surface.edges] if edges else (),
@@ -120,17 +111,12 @@ class BodyNode:
 
 
 class LoadMarker:
-    """Dots on the loaded nodes, an arrow of the total force and a clear mesh to drag.
-
-    Attributes:
-        mask: Loaded nodes of the surface, (S,).
-        drag_mesh: Mesh that receives mouse events.
-    """
+    """Dots on the loaded nodes, an arrow of the total force and a clear mesh to drag."""
 
     def __init__(self, server: LocalServer, body: Body) -> None:
-        """Add the nodes to the scene."""
+        """Add the nodes to the scene; `drag_mesh` receives mouse events."""
         self._server, self._body, scene, surface = server, body, server.scene, body.surface
-        self.mask = np.zeros(len(surface.nodes), dtype=bool)
+        self.mask = np.zeros(len(surface.nodes), dtype=bool)  # loaded nodes of the surface, (S,)
         self._dots = scene.add_point_cloud(
             "/patch", np.zeros((1, 3)), ARROW_COLOUR, point_size=DOT_SIZE, point_shape="circle"
         )
@@ -139,6 +125,10 @@ class LoadMarker:
         self.drag_mesh = scene.add_mesh_simple(
             "/drag", surface.undeformed, surface.triangles, side="double", **CLEAR
         )
+
+    def mark(self, nodes: Tensor) -> None:
+        """Mark the nodes of a mask of the body, (N,)."""
+        self.mask = nodes.numpy()[self._body.surface.nodes]
 
     def show(self, frame: Frame) -> None:
         """Update the nodes to a frame."""

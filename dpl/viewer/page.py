@@ -12,19 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 import viser
-from torch import Tensor
 
 from dpl.viewer.access import AccessPolicy, serve_with
 from dpl.viewer.camera import UP, Placement
-from dpl.viewer.controls import (
-    BAD,
-    GOOD,
-    GRASP,
-    Controls,
-    message,
-    newton_table,
-    problem_of,
-)
+from dpl.viewer.controls import BAD, GOOD, GRASP, Controls, message, newton_table, problem_of
 from dpl.viewer.frames import Body, Frame
 from dpl.viewer.hands import GraspingHand, PullingHand
 from dpl.viewer.nodes import BodyNode, LoadMarker, LocalServer, add_environment
@@ -47,19 +38,14 @@ class Page:
         server: viser server.
         placement: Places of the bodies and cameras that show them.
         controls: Controls of the panel.
-        recording: Recording of the shown frames.
-        folder: Folder of recordings.
+        recording: Recording of the shown frames, written to `folder`.
         frame: The most recent frame, if there is one.
         newton_frame: The most recent iterate of Newton for this request, if there is one.
         node: Node at the centre of the patch.
     """
 
     def __init__(self, body: Body, policy: AccessPolicy, *, title: str, folder: Path) -> None:
-        """Start the server behind an access policy, and the worker.
-
-        Raises:
-            RuntimeError: The server does not enforce the policy.
-        """
+        """Start the server behind an access policy, and the worker."""
         self.body, self.folder, self._policy = body, folder, policy
         with serve_with(policy), contextlib.redirect_stdout(io.StringIO()):
             self.server = LocalServer(policy.host, policy.port, label="dpl", verbose=False)
@@ -85,13 +71,8 @@ class Page:
         self._newton_node.frame.visible = self._body_node.label.visible = False
         self._marker = LoadMarker(self.server, body)
         self._connect()
-        self._mark(self._rotating(1.0).force.any(dim=1))
+        self._marker.mark(self._rotating(1.0).force.any(dim=1))
         self.worker.start()
-
-    @property
-    def url(self) -> str:
-        """Address of the page for the browser, with the token."""
-        return self._policy.url
 
     @property
     def hand(self) -> PullingHand | GraspingHand:
@@ -111,18 +92,17 @@ class Page:
         self._marker.drag_mesh.on_click(catch(self.click))
         for widgets, callback in (
             (controls.of_load, self.apply_controls),
-            (controls.of_moduli, self._apply_moduli),
+            (controls.of_moduli, self.apply_moduli),
             (controls.of_settings, self.apply_settings),
             ((controls.mode,), self.apply_mode),
         ):
             for widget in widgets:
                 widget.on_update(catch(callback))
-        for button, callback in (
-            *((controls.sample, self.sample), (controls.reset, self.reset)),
-            *((controls.record, self._toggle_recording), (controls.save, self._save)),
-            (controls.fit, self.fit),
-        ):
-            button.on_click(catch(callback))
+        controls.sample.on_click(catch(self.sample))
+        controls.reset.on_click(catch(self.reset))
+        controls.record.on_click(catch(self._toggle_recording))
+        controls.save.on_click(catch(self._save))
+        controls.fit.on_click(catch(self.fit))
         self.server.on_client_connect(catch(self._fit_client))
 
     # --- events of the browser
@@ -159,6 +139,11 @@ class Page:
             return
         self._submit(self.hand.hold(self.node, self.frame))
 
+    def apply_moduli(self, event: Any) -> None:
+        """Solve the last request with the moduli of the sliders."""
+        if event.client is not None:
+            self._submit()
+
     def apply_mode(self, event: Any = None) -> None:
         """Show the controls of the selected mode; the load or the grasp remains."""
         self._grabbed = self._rotating = None
@@ -167,10 +152,6 @@ class Page:
         self._mark_patch()
         if self.frame is not None:
             self._marker.show(self.frame)
-
-    def _apply_moduli(self, event: Any) -> None:
-        if event.client is not None:
-            self._submit()
 
     def sample(self, event: Any) -> None:
         """Apply a random load of the training distribution with its moduli."""
@@ -182,7 +163,7 @@ class Page:
         self.controls.follows_frame = True
         self._grasping.release()
         self._submit(lambda: request)
-        self._mark(request.force.any(dim=1))
+        self._marker.mark(request.force.any(dim=1))
         self.node = self.body.surface.middle_node(self._marker.mask)
 
     def reset(self, event: Any) -> None:
@@ -254,22 +235,17 @@ class Page:
 
     def _with_moduli(self, make: MakeRequest) -> MakeRequest:
         """Return a function that makes a request with the moduli of the sliders."""
-        controls = self.controls
-
-        def make_with_moduli() -> LoadRequest:
-            parameters = {name: slider.value for name, slider in controls.parameters.items()}
-            return replace(make(), young=controls.modulus, parameters=parameters)
-
-        return make_with_moduli
+        sliders = self.controls.parameters.items()
+        return lambda: replace(
+            make(),
+            young=self.controls.modulus,
+            parameters={name: slider.value for name, slider in sliders},
+        )
 
     def _mark_patch(self) -> None:
         """Mark the nodes of the patch and remove the error message."""
-        self._mark(self.hand.marked_nodes(self.node))
+        self._marker.mark(self.hand.marked_nodes(self.node))
         self._error = ""
-
-    def _mark(self, nodes: Tensor) -> None:
-        """Mark the nodes of a mask, (N,)."""
-        self._marker.mask = nodes.numpy()[self.body.surface.nodes]
 
     def _show(self, frame: Frame) -> None:
         """Show a frame; runs in the thread of the worker."""
@@ -296,9 +272,9 @@ class Page:
         """
         if self._rotating and self.server.get_clients():
             self.worker.submit(self._with_moduli(partial(self._rotating, time.monotonic())))
-        seconds, is_slow = self.worker.solving_time, self._is_slow
+        seconds, was_slow = self.worker.solving_time, self._is_slow
         self._is_slow = seconds > SLOW
-        if self._is_slow or is_slow or self._changed:
+        if self._is_slow or was_slow or self._changed:
             self._changed = False
             self._show_readings(f"Solving for {seconds:.0f} s ..." if self._is_slow else "")
 

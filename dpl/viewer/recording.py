@@ -30,18 +30,12 @@ SUFFIXES = {"VTU": ".pvd", "GIF": ".gif", "MP4": ".mp4"}
 
 
 class Recording:
-    """Frames with the times at which they were shown.
-
-    Attributes:
-        body: The body.
-        running: True while frames are recorded.
-        frames: Times from the first frame on [s], and frames.
-    """
+    """Frames with the times at which they were shown."""
 
     def __init__(self, body: Body) -> None:
-        """Create an empty recording."""
+        """Create an empty recording, which adds no frames before `start`."""
         self.body, self.running = body, False
-        self.frames: list[tuple[float, Frame]] = []
+        self.frames: list[tuple[float, Frame]] = []  # times from the first frame on [s]
         self._begin = 0.0
 
     def start(self) -> None:
@@ -56,11 +50,7 @@ class Recording:
             self.running = len(self.frames) < MAX_FRAMES
 
     def save_series(self, folder: Path) -> Path:
-        """Write VTU files with `nodal_fields` and a PVD file; return the path of the PVD file.
-
-        Raises:
-            ValueError: The recording is empty.
-        """
+        """Write VTU files with `nodal_fields` and a PVD file; return the path of the PVD file."""
         scene = self.body.scene
         path = self._free_path(folder, ".pvd")
         files = []
@@ -75,13 +65,7 @@ class Recording:
         return path
 
     def save_animation(self, folder: Path, suffix: str, size: tuple[int, int] = (960, 540)) -> Path:
-        """Write an animation in real time, ".gif" or ".mp4", and return its path.
-
-        The camera shows the body in all frames; `size` is width and height [pixel].
-
-        Raises:
-            ValueError: The recording is empty, or the format is unknown.
-        """
+        """Write an animation in real time, ".gif" or ".mp4", and return its path."""
         path = self._free_path(folder, suffix)
         frames = resample(self.frames)
         renderer = Renderer.fitting(self.body, frames, size)
@@ -117,13 +101,7 @@ def resample(frames: list[tuple[float, Frame]]) -> list[Frame]:
 def write_animation(
     path: Path, frames: list[Frame], renderer: Renderer, captions: Callable[[Frame], list[str]]
 ) -> None:
-    """Write frames, `FRAME_RATE` per second, with one colour scale as an animation; a GIF loops.
-
-    Raises:
-        ValueError: The path does not end with one of `FORMATS`.
-    """
-    if path.suffix not in FORMATS:
-        raise ValueError(f"path = {path.name} must end with {' or '.join(FORMATS)}")
+    """Write frames, `FRAME_RATE` per second, with one colour scale; a GIF loops."""
     top = colour_top(np.concatenate([frame.values for frame in frames]))
     images = (
         image
@@ -164,7 +142,6 @@ def animate_load(body: Body, path: Path, *, size: tuple[int, int] = (720, 405)) 
     """Write a looping animation of `rotating_load`, with the von Mises stress as colours.
 
     The caption has the largest error of `sim(force)` against finite elements, and its median time.
-    `path` ends with .gif or .mp4; `size` is width and height [pixel].
     """
     request_at, errors = rotating_load(body), []
     times = np.arange(DURATION * FRAME_RATE) / FRAME_RATE

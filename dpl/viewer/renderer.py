@@ -80,22 +80,14 @@ def round_up(number: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Renderer:
-    """Renderer of images of one body.
-
-    Attributes:
-        body: The body.
-        camera: The camera.
-        size: Width and height of images [pixel].
-    """
+    """Renderer of images of one body."""
 
     body: Body
     camera: Camera
-    size: tuple[int, int] = (960, 540)
+    size: tuple[int, int]  # width and height of images [pixel]
 
     @classmethod
-    def fitting(
-        cls, body: Body, frames: Sequence[Frame], size: tuple[int, int] = (960, 540)
-    ) -> "Renderer":
+    def fitting(cls, body: Body, frames: Sequence[Frame], size: tuple[int, int]) -> "Renderer":
         """Return a renderer whose camera shows the body at rest and in all frames, with arrows."""
         surface = body.surface
         points = np.concatenate([
@@ -123,7 +115,10 @@ class Renderer:
         if len(ends := self.body.arrow_ends(frame)):
             start, end = self.camera.project(ends, *self.size)[:, :2]
             ax.annotate("", end, start, arrowprops=ARROW)
-        _draw_captions(figure, captions)
+        title, others = " · ".join(captions[:1]), " · ".join(captions[1:])
+        x, y = 0.22 / figure.get_figwidth(), (1 - 0.18 / 5.4, 1 - 0.58 / 5.4)
+        figure.text(x, y[0], title, color=TEXT, size=18, weight="bold", va="top")
+        figure.text(x, y[1], others, color=TEXT_GREY, size=12.24, va="top")
         if top > 0:
             _draw_legend(figure, frame.quantity, top)
         canvas.draw()
@@ -170,15 +165,6 @@ class Renderer:
         brightness = 0.7 + 0.32 * np.abs(normals @ light) / np.linalg.norm(light)
         shades = np.clip(colours * brightness[:, None], 0, 255) / 255
         return soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1)
-
-
-def _draw_captions(figure: Figure, captions: Sequence[str]) -> None:
-    """Draw the first caption as a title in the upper left corner, and the others below it."""
-    width, height = figure.get_size_inches()
-    title, others = " · ".join(captions[:1]), " · ".join(captions[1:])
-    x, below = 0.22 / width, (0.18, 0.58)  # [inch]
-    figure.text(x, 1 - below[0] / height, title, color=TEXT, size=18, weight="bold", va="top")
-    figure.text(x, 1 - below[1] / height, others, color=TEXT_GREY, size=12.24, va="top")
 
 
 def _draw_legend(figure: Figure, quantity: str, top: float) -> None:

@@ -19,17 +19,11 @@ RIDGE = 1e-2  # Tikhonov parameter over the squared compliance; limits the use o
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Loads f = Phi q of the training distribution, restricted to the nodes within a radius.
-
-    Attributes:
-        scene: The body and its loads.
-        node: Node at the centre.
-        radius: Radius over L [-].
-    """
+    """Loads f = Phi q of the training distribution, restricted to the nodes within a radius."""
 
     scene: Scene
-    node: int
-    radius: float
+    node: int  # at the centre
+    radius: float  # over L [-]
 
     @cached_property
     def node_mask(self) -> Tensor:
@@ -49,15 +43,11 @@ class Patch:
     @cached_property
     def sliding_nodes(self) -> Tensor:
         """Mask of the nodes that are held while the patch slides, (N,); none if it cannot."""
-        linear, held, directions = (
-            self.scene.linear,
-            self.held_nodes,
-            [True] * self.scene.problem.shape[1],
-        )
+        linear, directions = self.scene.linear, [True] * self.scene.problem.shape[1]
         try:
-            return RigidPatch.of(linear, held.numpy(), directions, sliding=True).nodes
+            return RigidPatch.of(linear, self.held_nodes.numpy(), directions, sliding=True).nodes
         except ValueError:
-            return torch.zeros_like(held)
+            return torch.zeros_like(self.held_nodes)
 
     @cached_property
     def unit_loads(self) -> Tensor:
@@ -109,18 +99,12 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class LoadRequest:
-    """A load in SI units.
-
-    Attributes:
-        force: (N, D) [N], in 2D [N/m].
-        young: Young's modulus [Pa].
-        parameters: Value of each range of the law, by name.
-    """
+    """A load in SI units."""
 
     varying: ClassVar[tuple[str, ...]] = ("force", "young")  # between two frames
-    force: Tensor
-    young: float
-    parameters: Mapping[str, float]
+    force: Tensor  # (N, D) [N], in 2D [N/m]
+    young: float  # [Pa]
+    parameters: Mapping[str, float]  # value of each range of the law, by name
 
     def continues(self, other: "LoadRequest") -> bool:
         """Return True if the page interpolates from another request to this one."""
@@ -150,9 +134,9 @@ class LoadRequest:
         self, simulator: Simulator, tol: float | None, budget_ms: float | None = None
     ) -> Answer | GraspAnswer:
         """Return the answer of a simulator; see `Simulator` for the arguments."""
-        parameters = self.parameters
+        young, parameters = self.young, self.parameters
         return simulator(
-            self.force, young=self.young, parameters=parameters, tol=tol, budget_ms=budget_ms
+            self.force, young=young, parameters=parameters, tol=tol, budget_ms=budget_ms
         )
 
     def hand_force(self, answer: Any) -> Tensor:
@@ -174,20 +158,13 @@ class LoadRequest:
 
 @dataclass(frozen=True, eq=False)
 class GraspRequest(LoadRequest):
-    """A patch of the boundary that is moved as a rigid body, under the other forces on the body.
-
-    Attributes:
-        nodes: Mask of the nodes of the patch, (N,).
-        translation: Displacement of the mean of the patch over L, (D,) [-].
-        rotation: Rotation vector about it, (3,), in 2D the angle, (1,) [rad].
-        sliding: True if the patch slides in the plane across its normal, see `Simulator.grasp`.
-    """
+    """A patch of the boundary that is moved as a rigid body, under the other forces on the body."""
 
     varying: ClassVar[tuple[str, ...]] = ("force", "young", "translation", "rotation")
-    nodes: Tensor
-    translation: Tensor
-    rotation: Tensor
-    sliding: bool = False
+    nodes: Tensor  # mask of the nodes of the patch, (N,)
+    translation: Tensor  # of the mean of the patch over L, (D,) [-]
+    rotation: Tensor  # rotation vector about it, (3,), in 2D the angle, (1,) [rad]
+    sliding: bool = False  # in the plane across its normal, see `Gripper`
 
     def continues(self, other: LoadRequest) -> bool:
         """Return True if another request grasps the same patch in the same way."""
@@ -198,11 +175,9 @@ class GraspRequest(LoadRequest):
     def answer(
         self, simulator: Simulator, tol: float | None, budget_ms: float | None = None
     ) -> GraspAnswer:
-        """Return the answer of a simulator, which begins with the forces of the last grasp.
-
-        Without a budget it takes `GRASP_LIMIT_MS` at most.
-        """
-        return simulator.grasp(
+        """Return the answer from the state of the last grasp, in at most `GRASP_LIMIT_MS`."""
+        hand = replace(simulator.grasp, warm=True, sliding=self.sliding)
+        return hand(
             self.nodes.numpy(),
             (self.translation * simulator.scene.length).tolist(),
             self.rotation,
@@ -211,8 +186,6 @@ class GraspRequest(LoadRequest):
             parameters=self.parameters,
             tol=tol,
             budget_ms=GRASP_LIMIT_MS if budget_ms is None else budget_ms,
-            warm=True,
-            sliding=self.sliding,
         )
 
     def hand_force(self, answer: Any) -> Tensor:

@@ -21,21 +21,13 @@ MARK, MAX_MARKS = 0.014, 120  # half size over L [-] and number of the symbols o
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Surface of a body; in 2D the body itself. Cells of degree 2 are drawn by their corners.
-
-    Attributes:
-        problem: The body.
-        nodes: Nodes on the surface, (S,).
-        triangles: Triangles as indices into `nodes`, anticlockwise seen from outside, (T, 3).
-        edges: Edges of facets as indices into `nodes`, (K, 2).
-        feature_edges: Edges at the boundary or between facets that are not smooth, (R, 2).
-    """
+    """Surface of a body; in 2D the body itself. Cells of degree 2 are drawn by their corners."""
 
     problem: Problem
-    nodes: Ints
-    triangles: Ints
-    edges: Ints
-    feature_edges: Ints
+    nodes: Ints  # on the surface, (S,)
+    triangles: Ints  # indices into `nodes`, anticlockwise seen from outside, (T, 3)
+    edges: Ints  # of facets, indices into `nodes`, (K, 2)
+    feature_edges: Ints  # at the boundary or between facets that are not smooth, (R, 2)
 
     @classmethod
     def of(cls, problem: Problem) -> "Surface":
@@ -54,18 +46,14 @@ class Surface:
         """Undeformed positions of the nodes over L, (S, 3) [-]."""
         return _to_3d(self.problem.points.numpy())[self.nodes]
 
-    @cached_property
-    def _fixed(self) -> Ints:
-        """Nodes of the surface with a prescribed displacement, at most about `MAX_MARKS`."""
-        fixed = np.flatnonzero(~self.problem.free.numpy()[self.nodes].all(axis=1))
-        return fixed[:: len(fixed) // MAX_MARKS + 1]
-
     def supports(self, points: Floats) -> Floats:
         """Return the corners (8 n, 3, 3) of octahedra at the fixed nodes of a surface (S, 3)."""
+        fixed = np.flatnonzero(~self.problem.free.numpy()[self.nodes].all(axis=1))
+        fixed = fixed[:: len(fixed) // MAX_MARKS + 1]
         x, y, z = MARK * np.eye(3)
         signs = product((1, -1), repeat=3)  # of an octant, whose face has its normal outside
         corners = [(i * x, j * y, k * z)[:: i * j * k] for i, j, k in signs]
-        return (points[self._fixed, None, None] + corners).reshape(-1, 3, 3)
+        return (points[fixed, None, None] + corners).reshape(-1, 3, 3)
 
     @cached_property
     def planar(self) -> bool:
@@ -90,9 +78,7 @@ class Surface:
     def von_mises(self, displacement: Tensor, parameters: Tensor) -> Floats:
         """Return the von Mises stress over E at the nodes of the surface, (S,) [-].
 
-        Args:
-            displacement: Displacement over L, (N, D) [-].
-            parameters: Parameters as in a load, (1, P).
+        The displacement (N, D) is over L; `parameters` are those of a load, (1, P).
         """
         body, (cells, recovery) = self.problem.with_parameters(parameters), self._patches
         if body is not self.problem:

@@ -17,11 +17,7 @@ class Worker(threading.Thread):
 
     A browser sends drag events 20 times per second. Loads and motions are smoothed exponentially in
     time, so that the body is drawn up to `MAX_RATE` times per second; each frame is solved.
-
-    Attributes:
-        body: The body.
-        settings: The most recent settings.
-        min_frame_time: Shortest time for which an iterate of Newton is shown [s].
+    `settings` are the most recent ones.
     """
 
     def __init__(
@@ -42,12 +38,12 @@ class Worker(threading.Thread):
             on_newton: Receives each iterate of Newton; None when a new request is solved.
             on_error: Receives the message of a request that cannot be solved.
             smoothing_time: Time constant of the smoothing [s]; 0: no smoothing.
-            min_frame_time: See the attributes.
+            min_frame_time: Shortest time for which an iterate of Newton is shown [s].
         """
         super().__init__(name="viewer", daemon=True)
-        self.body, self.settings, self.min_frame_time = body, ViewSettings(), min_frame_time
+        self.body, self.settings = body, ViewSettings()
+        self.smoothing_time, self.min_frame_time = smoothing_time, min_frame_time
         self._on_frame, self._on_newton, self._on_error = on_frame, on_newton, on_error
-        self._smoothing_time = smoothing_time
         self._changed = threading.Condition()
         self._make_request: MakeRequest = body.zero_load
         self._submitted, self._finished, self._stopped = 1, 0, False  # counts of requests
@@ -108,7 +104,7 @@ class Worker(threading.Thread):
         self, number: int, goal: LoadRequest, settings: ViewSettings, start: LoadRequest | None
     ) -> tuple[LoadRequest, bool]:
         """Solve from `start` to `goal`; return the last request, and False for a newer request."""
-        if start is None or self._smoothing_time <= 0 or not goal.continues(start):
+        if start is None or self.smoothing_time <= 0 or not goal.continues(start):
             start = goal
         self._on_newton(None)
         current, distance, before = start, start.distance(goal), time.monotonic()
@@ -118,7 +114,7 @@ class Worker(threading.Thread):
             if rest * distance < ARRIVED:
                 current = goal
             else:
-                rest *= math.exp(-elapsed / self._smoothing_time)
+                rest *= math.exp(-elapsed / self.smoothing_time)
                 current = start.interpolate(goal, 1 - rest)
             self._begin = before = time.monotonic()
             frame = self.body.solve(current, settings)

@@ -16,7 +16,7 @@ from dpl import fem
 from dpl.fem.loads.forces import traction
 from dpl.fem.loads.sampling import SAMPLINGS, direction, logarithmic
 from dpl.fem.loads.sized import softest_node
-from dpl.inference.training_range import RangeCheck
+from dpl.inference.answer import RangeCheck
 
 END = fem.Plane(0, "max")
 CABLE = [

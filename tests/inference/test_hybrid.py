@@ -92,19 +92,19 @@ def same(one: Solution, other: Solution):
 @pytest.fixture
 def counted(monkeypatch):
     """Counts of assembled tangents and of factorisations."""
-    counts = {"tangent": 0, "factorise": 0}
+    counts = {"linearise": 0, "factorise": 0}
 
-    def counting(owner, name, key):
+    def count(owner, name):
         original = getattr(owner, name)
 
-        def wrapped(*args, **kwargs):
-            counts[key] += 1
+        def counting(*args, **kwargs):
+            counts[name] += 1
             return original(*args, **kwargs)
 
-        monkeypatch.setattr(owner, name, wrapped)
+        monkeypatch.setattr(owner, name, counting)
 
-    counting(Problem, "linearise", "tangent")
-    counting(SuperLU, "factorise", "factorise")
+    count(Problem, "linearise")
+    count(SuperLU, "factorise")
     return counts
 
 
@@ -138,10 +138,10 @@ def test_an_exact_prediction_costs_no_iteration_no_tangent_and_no_factor(
 ):
     """The counters see what Newton's method assembles for another prediction."""
     solve(hybrid(scene, loads, torch.zeros_like(loads.force)), first_of(loads))
-    assert counted["tangent"] >= counted["factorise"] >= 2
-    counted.update(tangent=0, factorise=0)
+    assert counted["linearise"] >= counted["factorise"] >= 2
+    counted.update(linearise=0, factorise=0)
     states = list(hybrid(scene, loads, stubs["exact"], rule).iterate(loads))
-    assert counted == {"tangent": 0, "factorise": 0}
+    assert counted == {"linearise": 0, "factorise": 0}
     assert len(states) == 1
     assert states[-1].converged.all()
     assert not states[-1].iterations.any()
@@ -170,14 +170,8 @@ def test_the_prediction_is_used_exactly_where_its_residual_is_smaller(scene, loa
     ("ratio_p", "ratio_1", "volume", "used"),
     [
         (0.5, 1.0, 0.9, True),
-        (1.0, 1.0, 0.9, False),
-        (2.0, 1.0, 0.9, False),
-        (0.5, 1.0, 0.0, False),
-        (0.5, 1.0, -1.0, False),
-        (0.5, 1.0, -torch.inf, False),
-        (torch.nan, 1.0, 0.9, False),
-        (torch.inf, 1.0, 0.9, False),
-        (0.5, 1.0, torch.nan, False),
+        *((ratio, 1.0, 0.9, False) for ratio in (1.0, 2.0, torch.nan, torch.inf)),
+        *((0.5, 1.0, volume, False) for volume in (0.0, -1.0, -torch.inf, torch.nan)),
     ],
 )
 def test_the_pick_rule_is_a_smaller_residual_with_nothing_inverted(ratio_p, ratio_1, volume, used):
@@ -186,26 +180,6 @@ def test_the_pick_rule_is_a_smaller_residual_with_nothing_inverted(ratio_p, rati
         for r, v in ((ratio_p, volume), (ratio_1, 0.9))
     )
     assert prefer_prediction(predicted, first) is used
-
-
-def test_a_zero_prediction_is_used_if_its_residual_is_smaller(scene, loads, stubs):
-    """The rule measures residuals, not quality: the first Newton step of a soft bar overshoots."""
-    predicted, first, *_ = hybrid(scene, loads, stubs["zero"], "paper").iterate(first_of(loads))
-    assert float(predicted.residual) == pytest.approx(1.0)
-    assert float(first.residual) > 1.0
-    assert prefer_prediction(predicted, first)
-
-
-@RULED
-def test_smaller_noise_costs_fewer_iterations(rule, scene, loads, stubs):
-    sizes = (1e-2, 1e-3, 1e-4, 1e-5)
-    counts = [
-        int(solve(hybrid(scene, loads, stubs[f"noise {e:g}"], rule), loads).iterations.sum())
-        for e in sizes
-    ]
-    classic = int(solve(scene.solver, loads).iterations.sum())
-    assert counts == sorted(counts, reverse=True)
-    assert counts[-1] < classic
 
 
 @pytest.mark.parametrize("size", [1e-3, 1e-5])
@@ -217,17 +191,6 @@ def test_from_a_good_prediction_no_tangent_is_needed(scene, loads, stubs, size, 
     assert states[-1].converged.all()
     assert not states[-1].factorisations.any()
     assert states[-1].from_guess.all()
-
-
-def test_steps_that_do_not_contract_leave_it_to_newton(scene, loads, stubs):
-    spent = 3
-    steps = AndersonSolver(scene.solver, max_iter=spent)
-    load = first_of(loads)
-    guess = stubs["noise 0.0001"][-1:]
-    answer = solve(Hybrid(lambda load: guess, scene.solver, steps=steps), load)
-    alone = solve(Hybrid(lambda load: guess, scene.solver), load)
-    assert answer.converged.all()
-    assert spent < int(answer.iterations) <= spent + int(alone.iterations)
 
 
 def test_the_hybrid_that_suits_a_scene_has_its_tolerance(scene, stubs):
@@ -304,26 +267,17 @@ def followed(scene, loads, guessed, **how):
     ("guessed", "goes_on"),
     [
         # the first correction is less than half of where it leads, upwards and downwards
-        ((1.0, 1.99), True),
-        ((1.0, 2.01), False),
-        ((1.0, 2.0), False),
-        ((1.0, 0.67), True),
-        ((1.0, 0.66), False),
+        *(((1.0, x), True) for x in (1.99, 0.67)),
+        *(((1.0, x), False) for x in (2.01, 2.0, 0.66, torch.nan, torch.inf)),
         ((0.0, 1e-9), False),
-        ((1.0, torch.nan), False),
-        ((1.0, torch.inf), False),
         # the second one is less than half of the first, or a tenth of where it leads
-        ((1.0, 1.4, 1.59), True),
-        ((1.0, 1.4, 1.61), False),
-        ((1.0, 1.01, 1.12), True),
-        ((1.0, 1.01, 1.13), False),
+        *(((1.0, 1.4, x), x < 1.6) for x in (1.59, 1.61)),
+        *(((1.0, 1.01, x), x < 1.125) for x in (1.12, 1.13)),
         ((1.0, 1.0, 1.11), True),
         # the third one and those that follow are less than half of the one before
-        ((1.0, 1.2, 1.28, 1.319), True),
-        ((1.0, 1.2, 1.28, 1.321), False),
+        *(((1.0, 1.2, 1.28, x), x < 1.32) for x in (1.319, 1.321)),
         ((1.0, 1.2, 1.21, 1.2151), False),
-        ((1.0, 1.2, 1.28, 1.31, 1.324), True),
-        ((1.0, 1.2, 1.28, 1.31, 1.326), False),
+        *(((1.0, 1.2, 1.28, 1.31, x), x < 1.325) for x in (1.324, 1.326)),
     ],
 )
 def test_newton_goes_on_from_a_prediction_while_its_corrections_contract(
@@ -340,22 +294,19 @@ def test_newton_goes_on_from_a_prediction_while_its_corrections_contract(
     assert counts == [*range(spent), spent + 1, spent + 2], "what was discarded counts"
 
 
-def test_an_answer_is_taken_whatever_correction_led_to_it(scene, loads):
+def test_an_answer_is_taken_whatever_correction_led_to_it_and_a_guess_is_given_up_with_newton(
+    scene, loads
+):
+    """Newton would go on in load steps from the last equilibrium; the classic path is known."""
     assert followed(scene, loads, (1.0, 5.0), ends=1) == ([1.0, 5.0], [0, 1])
     assert followed(scene, loads, (1.0, 1.2, 9.0), ends=2) == ([1.0, 1.2, 9.0], [0, 1, 2])
-
-
-def test_a_guess_that_newton_has_given_up_is_given_up(scene, loads):
-    """Newton would go on in load steps from the last equilibrium; the classic path is known."""
-    shown, counts = followed(scene, loads, (1.0, 1.2, 1.21, 1.211), lost=2)
-    assert shown == [1.0, 1.2, 7.0, 8.0]
-    assert counts == [0, 1, 3, 4]
+    lost = followed(scene, loads, (1.0, 1.2, 1.21, 1.211), lost=2)
+    assert lost == ([1.0, 1.2, 7.0, 8.0], [0, 1, 3, 4])
 
 
 def test_a_guess_that_newton_never_took_leaves_its_path_alone(scene, loads):
     """Newton began at rest: there is nothing to go back to."""
     corrector = Scripted(scene.problem, (0.0, 5.0, -9.0, 3.0))
-    corrector.lost = None
     original = corrector.iterate
     corrector.iterate = lambda load, guess=None: (
         state._replace(from_guess=torch.tensor([False])) for state in original(load, guess=guess)
@@ -441,58 +392,40 @@ def test_it_is_said_what_goes_on_from_a_guess(scene, loads, stubs, rule):
         assert bool(last.from_guess) == guessed
 
 
-POOR = {"minus": lambda u: -u, "half": lambda u: 0.5 * u, "too far": lambda u: 1.5 * u}
-
-
-@pytest.mark.parametrize("name", POOR)
-def test_a_poor_prediction_is_given_up_for_the_classic_path(scene, loads, truth, name):
+@pytest.mark.parametrize("part", [-1.0, 0.5, 1.5])
+def test_a_poor_prediction_is_given_up_for_the_classic_path(scene, loads, truth, part):
     """Newton itself would go on from it: 8 to 13 iterations where 6 from rest are enough."""
-    for load, exact in zip(loads.unbatch(), truth.split(1), strict=True):
-        states = list(Hybrid(lambda load, u=exact: POOR[name](u), scene.solver).iterate(load))
-        alone = [*scene.solver.iterate(load, guess=POOR[name](exact))][-1]
-        _, *classic = scene.solver.iterate(load)
-        assert states[0].from_guess.all()
-        assert not states[-1].from_guess.any()
-        assert torch.equal(states[-1].displacement, classic[-1].displacement)
-        spent = int(states[-1].iterations - classic[-1].iterations)
-        assert 1 <= spent <= 3
-        assert int(states[-1].iterations) < int(alone.iterations) + spent
-        ours = states[-len(classic) :]
-        for one, other in zip(ours, classic, strict=True):
-            assert torch.equal(one.displacement, other.displacement)
-            assert int(one.iterations - other.iterations) == spent
+    load, guess = first_of(loads), part * truth[-1:]
+    states = list(Hybrid(lambda load: guess, scene.solver).iterate(load))
+    alone = [*scene.solver.iterate(load, guess=guess)][-1]
+    _, *classic = scene.solver.iterate(load)
+    assert states[0].from_guess.all()
+    assert not states[-1].from_guess.any()
+    spent = int(states[-1].iterations - classic[-1].iterations)
+    assert 1 <= spent <= 3
+    assert int(states[-1].iterations) < int(alone.iterations) + spent
+    for one, other in zip(states[-len(classic) :], classic, strict=True):
+        assert torch.equal(one.displacement, other.displacement)
+        assert int(one.iterations - other.iterations) == spent
 
 
 @pytest.mark.parametrize("size", [1e-3, 1e-5])
 def test_a_good_prediction_is_kept_to_the_end(scene, loads, stubs, size):
-    for k, load in enumerate(loads.unbatch()):
-        guess = stubs[f"noise {size:g}"][k : k + 1]
-        states = list(Hybrid(lambda load, u=guess: u, scene.solver).iterate(load))
-        alone = list(scene.solver.iterate(load, guess=guess))
-        assert all(state.from_guess.all() for state in states)
-        assert len(states) == len(alone)
-        for one, other in zip(states, alone, strict=True):
-            assert same(one, other)
-        assert int(states[-1].iterations) < int(solve(scene.solver, load).iterations)
+    load, guess = first_of(loads), stubs[f"noise {size:g}"][-1:]
+    states = list(Hybrid(lambda load: guess, scene.solver).iterate(load))
+    alone = list(scene.solver.iterate(load, guess=guess))
+    assert all(state.from_guess.all() for state in states)
+    assert len(states) == len(alone)
+    assert all(same(one, other) for one, other in zip(states, alone, strict=True))
+    assert int(states[-1].iterations) < int(solve(scene.solver, load).iterations)
 
 
 @EVERY
 def test_a_batch_is_its_members(rule, scene, loads, stubs):
-    mixed = torch.stack(
-        [
-            stubs["nan"][0],
-            stubs["exact"][1],
-            stubs["noise 0.001"][2],
-            stubs["inverted"][3],
-        ]
-    )
+    names = ("nan", "exact", "noise 0.001", "inverted")
+    mixed = torch.stack([stubs[name][k] for k, name in enumerate(names)])
     whole = solve(hybrid(scene, loads, mixed, rule), loads)
-    parts = [
-        solve(
-            hybrid(scene, loads, mixed, rule), Load(loads.force[k : k + 1], loads.young[k : k + 1])
-        )
-        for k in range(4)
-    ]
+    parts = [solve(hybrid(scene, loads, mixed, rule), load) for load in loads.unbatch()]
     assert same(whole, Solution(*(torch.cat(column) for column in zip(*parts, strict=True))))
 
 
@@ -501,7 +434,7 @@ def test_no_load_costs_nothing(scene, counted):
     zero = solve(Hybrid(lambda load: torch.zeros_like(load.force), scene.solver), rest)
     assert zero.converged
     assert not zero.displacement.any()
-    assert counted == {"tangent": 0, "factorise": 0}
+    assert counted == {"linearise": 0, "factorise": 0}
     bent = solve(Hybrid(lambda load: load.force + 0.01 * scene.problem.free, scene.solver), rest)
     assert bent.converged
     assert not bent.displacement.any(), "a body without load is at rest, whatever is predicted"
@@ -532,7 +465,7 @@ def test_the_network_alone_is_judged_at_what_it_says(scene, loads, stubs, name, 
     assert answer.converged.any() == (name == "exact")
     assert not answer.iterations.any()
     assert answer.from_guess.all()
-    assert counted == {"tangent": 0, "factorise": 0}
+    assert counted == {"linearise": 0, "factorise": 0}
 
 
 def test_the_network_alone_converges_where_its_own_tolerance_is_met(scene, loads, stubs):
@@ -541,11 +474,3 @@ def test_the_network_alone_converges_where_its_own_tolerance_is_met(scene, loads
     for tol, met in ((1.01 * ratio, True), (0.99 * ratio, False)):
         answer = solve(Direct(lambda load: guess, scene.problem, tol), loads)
         assert bool(answer.converged.all()) is met
-
-
-def test_the_hybrid_that_suits_a_scene_starts_from_the_prediction(scene, batch):
-    load = batch.load.unbatch()[0]
-    exact = solve(scene.solver, load).displacement
-    first = next(default_hybrid(lambda _: exact, scene, tol=1e-6).iterate(load))
-    assert first.converged.all()
-    assert torch.equal(first.displacement, exact)

@@ -5,42 +5,38 @@ import math
 import shutil
 import warnings
 from fractions import Fraction
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from simulators import newton_everywhere, simulator_of, solution, with_errors
 
 import dpl
 import dpl.inference.request as request_module
 import dpl.inference.simulator as simulator_module
 from dpl.config import build
-from dpl.fem import Status, SubspaceNewton, solve
+from dpl.fem import solve
 from dpl.inference import Hybrid, Simulator
-from dpl.models import CNN, FCNN, GNN
+from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
 
 E = 4500.0
 
 
-def simulator_of(scene, predict=None, **more):
-    """Return a simulator whose network is a function of a load; left out: half the truth."""
-    torch.manual_seed(0)
-    surrogate = Surrogate(FCNN(scene, width=4), MSE(), scene)
-    half = lambda load: 0.5 * solve(scene.solver, load).displacement  # noqa: E731
-    surrogate.predict = predict or half
-    return Simulator(surrogate, **more)
-
-
 @pytest.fixture(scope="module")
 def truth(scene, loads):
     """Their displacements, (B, N, D) [m]."""
-    return scene.length * solve(scene.solver, loads).displacement
+    return scene.length * solution(scene, loads)
 
 
-def test_a_tolerance_is_kept_and_the_answer_is_newtons(scene, forces, truth):
-    sim = simulator_of(scene)
+@pytest.fixture(scope="module")
+def sim(scene):
+    """A simulator whose predictions are half the solution."""
+    return simulator_of(scene, 0.5)
+
+
+def test_a_tolerance_is_kept_and_the_answer_is_newtons(scene, forces, truth, sim):
     for tol in (1e-3, 1e-6, 1e-8):
         answer = sim(forces, tol=tol)
         assert answer.converged.all()
@@ -53,23 +49,21 @@ def test_a_tolerance_is_kept_and_the_answer_is_newtons(scene, forces, truth):
         off = (ours - answer.residual).abs() * dimensionless.flatten(1).norm(dim=1)
         assert (off <= problem.roundoff_bound(u)).all()  # metres and back round u
     assert torch.allclose(answer.displacement, truth, rtol=0, atol=1e-6 * scene.length)
+    exact = simulator_of(scene, 1.0)(forces, tol=1e-6)
+    assert exact.method == ["prediction"] * 4
+    assert exact.converged.all()
+    assert not exact.iterations.any()
 
 
-def test_without_a_tolerance_the_network_answers_and_says_how_wrong_it_is(scene, forces, truth):
-    answer = simulator_of(scene)(forces)
+def test_without_a_tolerance_the_network_answers_and_says_how_wrong_it_is(
+    scene, forces, truth, sim
+):
+    answer = sim(forces)
     assert answer.method == ["prediction"] * 4
     assert torch.allclose(answer.displacement, 0.5 * truth)
     assert not answer.converged.any()
     assert not answer.iterations.any()
     assert not any("stab" in words or "converged" in words for words in answer.summary)
-
-
-def test_an_exact_prediction_needs_no_iteration(scene, forces):
-    sim = simulator_of(scene, lambda load: solve(scene.solver, load).displacement)
-    answer = sim(forces, tol=1e-6)
-    assert answer.method == ["prediction"] * 4
-    assert answer.converged.all()
-    assert not answer.iterations.any()
 
 
 BAD = {
@@ -84,7 +78,7 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_whatever_the_network_says_a_tolerance_is_kept(scene, forces, truth, name):
     def predict(load):
-        u = BAD[name](solve(scene.solver, load).displacement)
+        u = BAD[name](solution(scene, load))
         return torch.where(scene.problem.free, u, 0.0) if name != "nan" else u
 
     answer = simulator_of(scene, predict)(forces, tol=1e-8)
@@ -92,14 +86,7 @@ def test_whatever_the_network_says_a_tolerance_is_kept(scene, forces, truth, nam
     assert torch.allclose(answer.displacement, truth, rtol=0, atol=1e-6 * scene.length)
 
 
-def test_a_useless_network_alone_is_said_to_be_not_valid(scene, forces):
-    answer = simulator_of(scene, lambda load: torch.full_like(load.force, torch.nan))(forces)
-    assert all(words.startswith("NOT VALID") for words in answer.summary)
-    assert not answer.converged.any()
-
-
-def test_numpy_in_numpy_out_and_one_load_gives_one_answer(scene, forces):
-    sim = simulator_of(scene)
+def test_numpy_in_numpy_out_and_one_load_gives_one_answer(scene, forces, sim):
     several, single = sim(forces.numpy(), tol=1e-6), sim(forces[1].numpy(), tol=1e-6)
     assert isinstance(several.displacement, np.ndarray)
     assert several.displacement.shape == forces.shape
@@ -118,8 +105,7 @@ def test_numpy_in_numpy_out_and_one_load_gives_one_answer(scene, forces):
     tensors.displacement.mul_(2.0)  # not a tensor of inference mode
 
 
-def test_answers_scale_with_youngs_modulus(scene, forces):
-    sim = simulator_of(scene)
+def test_answers_scale_with_youngs_modulus(scene, forces, sim):
     soft, stiff = sim(forces, tol=1e-8), sim(1e6 * forces, young=1e6 * E, tol=1e-8)
     assert torch.allclose(soft.displacement, stiff.displacement, rtol=1e-9)
     mixed = sim(forces, young=[E, 2 * E, E, E], tol=1e-8)
@@ -136,43 +122,18 @@ def test_a_body_without_load_is_at_rest(scene, forces):
     assert "at rest" in answer.summary
 
 
-def test_small_loads_are_answered_linearly(scene, forces):
-    sim = simulator_of(scene)
-    answer = sim(1e-7 * forces[0], tol=1e-3)
-    assert answer.method == "linear"
-    assert answer.converged
-
-
-def newton_everywhere(scene, **options):
-    """Return Newton's method in the space of all displacements."""
-    problem = scene.problem
-    count = int(problem.free.sum())
-    vectors = torch.zeros(*problem.shape, count, dtype=torch.float64)
-    vectors[problem.free] = torch.eye(count).double()
-    return SubspaceNewton(problem, vectors, **options)
-
-
-def with_errors(sim, prediction, outside):
-    """Let a model state these relative errors of its prediction and outside of its modes."""
-    sim.surrogate.predict_with_errors = lambda load: (
-        sim.surrogate.predict(load),
-        torch.tensor([[prediction, outside]] * len(load.force), dtype=torch.float64),
-    )
-    return sim
-
-
 @pytest.mark.parametrize("known", [math.inf, 0.02])
 @pytest.mark.parametrize("has_modes", [False, True])
 def test_the_error_of_a_prediction_is_that_of_its_answer(scene, forces, loads, has_modes, known):
     newton = newton_everywhere(scene) if has_modes else None
-    near = lambda load: 1.03 * solve(scene.solver, load).displacement  # noqa: E731
+    near = lambda load: 1.03 * solution(scene, load)  # noqa: E731
     sim = with_errors(simulator_of(scene, near, newton=newton, steps=0), known, 1e-6)
     stated = list(map(sim.prediction_error, loads.unbatch(), near(loads).split(1)))
     assert stated == pytest.approx(sim(forces).error.tolist())
 
 
 def test_steps_in_the_modes_follow_while_the_estimated_error_is_large(scene, forces, truth):
-    near = lambda load: 1.03 * solve(scene.solver, load).displacement  # noqa: E731
+    near = lambda load: 1.03 * solution(scene, load)  # noqa: E731
     sim = with_errors(simulator_of(scene, near, newton=newton_everywhere(scene)), 0.05, 1e-6)
 
     def errors(answer):
@@ -214,7 +175,7 @@ def clock(monkeypatch):
 
 
 def test_a_budget_ends_it_and_the_best_so_far_is_returned(scene, forces, clock):
-    sim = simulator_of(scene)
+    sim = simulator_of(scene, 0.5)
     whole = sim(forces[0], tol=1e-10, budget_ms=1e6)  # times all stages
     assert whole.converged
     found = []
@@ -237,22 +198,21 @@ def test_a_budget_ends_it_and_the_best_so_far_is_returned(scene, forces, clock):
 
 def test_several_loads_share_the_time_that_they_took(scene, forces, clock):
     begin = next(clock)
-    answer = simulator_of(scene)(forces, tol=1e-6)
+    answer = simulator_of(scene, 0.5)(forces, tol=1e-6)
     spent = next(clock) - begin
     assert (answer.milliseconds > 0).all()
     assert 0.5 * spent < float(answer.milliseconds.sum()) <= spent
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0])
-def test_loads_of_the_family_lie_inside(scene, factor):
+def test_loads_of_the_family_lie_inside(scene, factor, sim):
     drawn = scene.loads.sample((0, 10), range(20), amplitude=factor)
-    answer = simulator_of(scene)(drawn.force * scene.force_unit * E)
+    answer = sim(drawn.force * scene.force_unit * E)
     assert (answer.out_of_span < 1e-9).all()
     assert not answer.out_of_distribution.any()
 
 
-def test_how_far_a_load_lies_outside_is_said(scene):
-    sim = simulator_of(scene)
+def test_how_far_a_load_lies_outside_is_said(scene, sim):
     largest = scene.loads.eigenmodes.vectors @ (2.5 * scene.loads.q_max)
     reach = torch.where(scene.loads.loadable_dofs, largest, 0.0) * scene.force_unit * E
     answer = sim(reach)
@@ -265,15 +225,6 @@ def test_how_far_a_load_lies_outside_is_said(scene):
     assert inside.out_of_distribution
     assert inside.out_of_span == pytest.approx(1.0)
     assert "unlike the training's" in inside.summary
-
-
-def test_stability_is_examined_on_request(scene, forces):
-    sim = simulator_of(scene)
-    plain, examined = sim(forces[0], tol=1e-8), sim(forces[0], tol=1e-8, stability=True)
-    assert examined.negative_pivots == 0
-    assert examined.summary.endswith(", stable")
-    if plain.negative_pivots < 0:
-        assert "not examined" in plain.summary
 
 
 def test_an_unstable_answer_is_said_to_be_unstable(make_scene):
@@ -289,8 +240,8 @@ def test_an_unstable_answer_is_said_to_be_unstable(make_scene):
     assert "UNSTABLE" in answer.summary
 
 
-def test_a_load_without_an_answer_is_said_to_have_none(scene, forces):
-    answer = simulator_of(scene)(1e6 * forces[0], tol=1e-8)
+def test_a_load_without_an_answer_is_said_to_have_none(scene, forces, sim):
+    answer = sim(1e6 * forces[0], tol=1e-8)
     assert not answer.converged
     assert "converged" not in answer.summary
     assert "times the training's largest" in answer.summary
@@ -306,23 +257,15 @@ def test_the_last_answer_starts_the_next_where_it_is_nearer(scene, forces, truth
     assert not torch.equal(again.displacement, first.displacement)
 
 
-def test_forces_on_held_nodes_change_nothing(scene, forces):
+def test_forces_on_held_nodes_change_nothing(scene, forces, truth):
     """Programs export reactions with the loads; 1e10 N on a clamp are nothing either."""
     held = ~scene.problem.free
-    reactions = (
-        scene.problem.internal_force(
-            solve(
-                scene.solver, scene.load_of(forces, torch.full((4,), E, dtype=torch.float64))
-            ).displacement
-        )
-        * E
-        * scene.force_unit
-    )
+    reactions = scene.problem.internal_force(truth / scene.length) * E * scene.force_unit
     seen = []
 
     def predict(load):
         seen.append(load.force)
-        return 0.5 * solve(scene.solver, load).displacement
+        return 0.5 * solution(scene, load)
 
     sim = simulator_of(scene, predict)
     for tol in (None, 1e-6):
@@ -341,27 +284,11 @@ def test_forces_on_held_nodes_change_nothing(scene, forces):
     assert not only.displacement.any()
 
 
-def test_a_wrong_answer_is_not_in_balance_because_of_forces_on_held_nodes(scene, forces, truth):
-    """3 % off, with 1e10 N on the clamp: in balance to 4e-7 of all that was given."""
-    off = lambda load: 1.03 * truth[:1] / scene.length  # noqa: E731
-    force = torch.where(scene.problem.free, forces[0], 1e10)
-    answer = simulator_of(scene, off)(force, tol=1e-6)
-    assert answer.converged
-    assert answer.method != "prediction"
-    assert torch.allclose(answer.displacement, truth[0], rtol=0, atol=1e-5 * scene.length)
-    alone = simulator_of(scene, off)(force)
-    assert not alone.converged
-    assert alone.residual > 1e-2
-
-
-@pytest.mark.parametrize("network", ["fcnn", "gnn", "cnn"])
-def test_a_network_is_not_told_of_forces_on_held_nodes(make_scene, network):
+def test_a_network_is_not_told_of_forces_on_held_nodes(make_scene):
     """With weight on all nodes in training it hears of that and of nothing else."""
     weight = torch.full((45, 3), -1e-5, dtype=torch.float64)
     for scene in (make_scene(), make_scene(constant_force=weight)):
-        nets = {"fcnn": partial(FCNN, width=4), "gnn": partial(GNN, width=4), "cnn": CNN}
-        torch.manual_seed(0)
-        surrogate = Surrogate(nets[network](scene), MSE(), scene).eval()
+        surrogate = Surrogate(FCNN(scene, width=4), MSE(), scene).eval()
         load = scene.loads.sample((0, 9), [0])
         held = load._replace(force=torch.where(scene.problem.free, load.force, 7.0))
         with torch.no_grad():
@@ -392,9 +319,9 @@ def test_huge_forces_are_never_in_balance(scene, forces, size, tol):
     assert answer.residual == pytest.approx(1.0)
 
 
-def test_a_tolerance_that_rounding_does_not_allow_is_said_not_to_be_kept(scene, forces, truth):
+def test_a_tolerance_that_rounding_does_not_allow_is_said_not_to_be_kept(scene, forces, truth, sim):
     with pytest.warns(UserWarning, match="rounding allows no less"):
-        answer = simulator_of(scene)(forces[0], tol=1e-15, stability=True)
+        answer = sim(forces[0], tol=1e-15, stability=True)
     assert not answer.converged
     assert 1e-15 <= answer.residual < 1e-11
     assert "of the load, the least that rounding allows, " in answer.summary
@@ -406,14 +333,10 @@ def test_a_tolerance_that_rounding_does_not_allow_is_said_not_to_be_kept(scene, 
 REALS = {
     "float32": lambda f: f.astype(np.float32),
     "long double": lambda f: f.astype(np.longdouble),
-    "big endian": lambda f: f.astype(">f8"),
     "nested lists": lambda f: f.tolist(),
     "objects": lambda f: f.astype(object),
     "negative strides": lambda f: f[::-1, ::-1].copy()[::-1, ::-1],
-    "columns first": np.asfortranarray,
     "every other": lambda f: np.repeat(f, 2, axis=0)[::2],
-    "unmasked": lambda f: np.ma.masked_array(f),
-    "tensor": torch.from_numpy,
     "list of tensors": lambda f: list(torch.from_numpy(f)),
     "tensor with gradient": lambda f: torch.from_numpy(f).requires_grad_(),
     "transposed tensor": lambda f: torch.from_numpy(f.T.copy()).T,
@@ -422,8 +345,8 @@ REALS = {
 
 
 @pytest.mark.parametrize("kind", REALS)
-def test_real_numbers_are_taken_however_they_are_held(scene, forces, kind):
-    sim, array = simulator_of(scene), forces[0].numpy()
+def test_real_numbers_are_taken_however_they_are_held(scene, forces, kind, sim):
+    array = forces[0].numpy()
     given = REALS[kind](array)
     read_only = array.copy()
     read_only.flags.writeable = False
@@ -436,8 +359,8 @@ def test_real_numbers_are_taken_however_they_are_held(scene, forces, kind):
     assert answer.residual == pytest.approx(plain.residual, rel=1e-12 if exact else 1e-1)
 
 
-def test_what_is_given_is_not_changed(scene, forces):
-    sim, array = simulator_of(scene), forces[0].numpy().copy()
+def test_what_is_given_is_not_changed(scene, forces, sim):
+    array = forces[0].numpy().copy()
     before = array.copy()
     held = torch.from_numpy(array)
     sim(array, tol=1e-3)
@@ -447,27 +370,18 @@ def test_what_is_given_is_not_changed(scene, forces):
 
 @pytest.mark.parametrize(
     "value",
-    [
-        2 * E,
-        int(2 * E),
-        np.float32(2 * E),
-        [2 * E],
-        np.array(2 * E),
-        torch.tensor(2 * E),
-        Fraction(int(2 * E)),
-    ],
+    [int(2 * E), np.float32(2 * E), [2 * E], torch.tensor(2 * E), Fraction(int(2 * E))],
     ids=repr,
 )
-def test_a_modulus_is_any_real_number(scene, forces, value):
-    sim = simulator_of(scene)
+def test_a_modulus_is_any_real_number(scene, forces, value, sim):
     for k in (slice(0, 1), 0):
         found, wanted = sim(forces[k], young=value), sim(forces[k] / 2)
         assert torch.equal(found.displacement, wanted.displacement)
 
 
 @pytest.mark.parametrize("value", [np.float32(1e-3), np.array(1e-3), torch.tensor(1e-3)])
-def test_a_tolerance_is_any_real_number(scene, forces, value):
-    answer = simulator_of(scene)(forces[0], tol=value, budget_ms=1e9 * value)
+def test_a_tolerance_is_any_real_number(scene, forces, value, sim):
+    answer = sim(forces[0], tol=value, budget_ms=1e9 * value)
     assert answer.converged
     assert answer.residual < 1.001e-3
 
@@ -477,12 +391,10 @@ ABSURD = {
     "boolean": True,
     "complex": 1e-3 + 1e-3j,
     "date": np.datetime64("2020-01-01"),
-    "function": abs,
     "number too large": 10**400,
     "unequal rows": [[1.0, 2.0], [3.0]],
     "empty": [],
     "text in objects": np.array(["1e-3"], dtype=object),
-    "boolean in objects": np.array([True, 1e-3], dtype=object),
     "nothing in objects": np.array([None, 1e-3], dtype=object),
     "masked": np.ma.masked_array([1e-3], [True]),
     "meta tensor": torch.empty(3, device="meta"),
@@ -496,8 +408,7 @@ ABSURD = {
 
 
 @pytest.mark.parametrize("kind", ABSURD)
-def test_what_is_no_real_number_is_refused_in_a_line_that_names_it(scene, forces, kind):
-    sim = simulator_of(scene)
+def test_what_is_no_real_number_is_refused_in_a_line_that_names_it(scene, forces, kind, sim):
     for name in ("force", "young", "tol", "budget_ms"):
         requested = {"force": forces[0].numpy(), name: ABSURD[kind]}
         with warnings.catch_warnings():
@@ -508,14 +419,12 @@ def test_what_is_no_real_number_is_refused_in_a_line_that_names_it(scene, forces
         assert len(str(caught.value)) < 300
 
 
-def test_forces_that_are_refused(scene, forces):
-    """Of the right shape, and no real numbers; not finite; or beyond float64 over the modulus."""
-    sim, array, free = simulator_of(scene), forces[0].numpy(), scene.problem.free
+def test_forces_that_are_refused(scene, forces, sim):
+    """Of the right shape, and not real numbers; not finite; or beyond float64 over the modulus."""
+    array, free = forces[0].numpy(), scene.problem.free
     gap = [row[:-1] if k == 3 else row for k, row in enumerate(array.tolist())]
-    no_numbers = [array + 1j, array > 0, array.astype(str), np.ma.masked_array(array, array > 0)]
     words = r"^force must be real numbers"
-    refused = [(force, E, words) for force in (*no_numbers, forces[0].to("meta"), gap)]
-    refused.append((forces[0].to_sparse(), E, words))
+    refused = [(np.ma.masked_array(array, array > 0), E, words), (gap, E, words)]
     refused.append(([[1.0, 2.0, 3.0], [1.0]], E, words + "; .*inhomogeneous"))
     for bad in (math.nan, math.inf):
         refused.append((torch.where(free, forces[0], bad), E, "force: a number is not finite"))
@@ -533,7 +442,7 @@ def test_forces_that_are_refused(scene, forces):
 @pytest.mark.parametrize("ratio", [-1.0, -1.5, 0.5, 0.7])
 def test_a_poisson_ratio_that_no_solid_has_is_refused(make_scene, ratio):
     scene = make_scene(poisson=[0.2, 0.4])
-    sim = Simulator(Surrogate(FCNN(scene, width=4), MSE(), scene))
+    sim = simulator_of(scene, lambda load: 0 * load.force)
     force = scene.loads.sample((0, 9), [0]).force[0] * E * scene.force_unit
     with pytest.raises(ValueError, match=r"poisson = .* must lie between -1 and 0\.5"):
         sim(force, parameters={"poisson": ratio})
@@ -550,7 +459,6 @@ def test_a_poisson_ratio_that_no_solid_has_is_refused(make_scene, ratio):
     [
         ({"force": np.zeros((3, 3))}, "force: its shape is"),
         ({"force": np.zeros(7)}, "force: its shape is"),
-        ({"force": None}, "force"),
         *(({"error": value}, "error = .* must be above 0") for value in (0.0, -1, math.nan)),
         ({"tol": 0.0}, "tol = 0.0"),
         ({"tol": math.nan}, "tol = nan"),
@@ -571,22 +479,21 @@ def test_a_poisson_ratio_that_no_solid_has_is_refused(make_scene, ratio):
     ],
     ids=str,
 )
-def test_what_cannot_be_asked_is_refused_in_words(scene, forces, arguments, words):
+def test_what_cannot_be_asked_is_refused_in_words(scene, forces, arguments, words, sim):
     requested = {"force": forces[0].numpy()} | arguments
-    if requested["force"] is None:
-        requested["force"] = forces[0].numpy() * np.nan
     with pytest.raises(ValueError, match=words):
-        simulator_of(scene)(**requested)
+        sim(**requested)
 
 
 def test_a_range_of_moduli_wants_to_know_which(make_scene):
     scene = make_scene(young=[1e9, 2e9])
+    sim = simulator_of(scene)
     force = torch.zeros(scene.problem.shape, dtype=torch.float64)
     with pytest.raises(ValueError, match="young: the scene has a range"):
-        simulator_of(scene)(force)
+        sim(force)
     with pytest.raises(ValueError, match="steps = -1 must be 0 or more"):
         simulator_of(scene, steps=-1)
-    assert simulator_of(scene)(force, young=1e12).method == "rest"
+    assert sim(force, young=1e12).method == "rest"
 
 
 def test_a_trained_run_becomes_a_simulator(trained_run, tmp_path):
@@ -614,4 +521,4 @@ def test_the_corrector_is_the_solver_with_the_same_stiffness(scene):
         for newton in (scene.corrector, scene.solver)
     )
     assert torch.allclose(ours.displacement, theirs.displacement, atol=1e-8)
-    assert ours.status.tolist() == theirs.status.tolist() == [int(Status.CONVERGED)]
+    assert ours.status.tolist() == theirs.status.tolist() == [int(dpl.fem.Status.CONVERGED)]

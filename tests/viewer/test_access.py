@@ -19,9 +19,10 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
+from websockets.server import ServerProtocol
 from websockets.sync.client import connect
 
-from dpl.viewer import AccessPolicy, Page
+from dpl.viewer import AccessPolicy
 from dpl.viewer.access import (
     MAX_CHARACTERS,
     MAX_MESSAGE,
@@ -93,16 +94,14 @@ DENIED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("allowed", ALLOWED, ids=str)
-def test_requests_of_this_page_are_allowed(allowed):
-    assert policy_at(allowed_hosts=("lab-7",)).denial_reason(allowed) is None
-
-
-@pytest.mark.parametrize(("denied", "reason"), DENIED, ids=lambda value: ascii(value)[:80])
-def test_other_requests_are_denied_with_their_reason(denied, reason):
-    status, text = policy_at(allowed_hosts=("lab-7",)).denial_reason(denied)
-    assert status == reason[0]
-    assert text.startswith(reason[1])
+def test_requests_of_this_page_are_allowed_and_others_denied_with_their_reason():
+    policy = policy_at(allowed_hosts=("lab-7",))
+    for allowed in ALLOWED:
+        assert policy.denial_reason(allowed) is None, allowed
+    for denied, reason in DENIED:
+        status, text = policy.denial_reason(denied)
+        assert status == reason[0], denied
+        assert text.startswith(reason[1]), denied
 
 
 def test_a_host_without_a_port_means_port_80():
@@ -137,13 +136,14 @@ def test_the_url_can_be_opened_by_a_browser_on_this_machine(host, address, every
 
 def respond(*args, answer=None, **more):
     """Return the response to a request, and the requests that reach the handler of the page."""
-    seen = []
+    seen, connection = [], SimpleNamespace(respond=ServerProtocol().reject)
 
-    def handle(connection, inner):
-        seen.append((connection, inner))
+    def handle(own, inner):
+        assert own is connection
+        seen.append(inner)
         return answer
 
-    return policy_at().authenticate(handle)("connection", request(*args, **more)), seen
+    return policy_at().authenticate(handle)(connection, request(*args, **more)), seen
 
 
 def test_a_denied_request_does_not_reach_the_page():
@@ -151,8 +151,7 @@ def test_a_denied_request_does_not_reach_the_page():
     assert seen == []
     assert (found.status_code, found.reason_phrase) == (403, "Forbidden")
     assert found.body == policy_at().denial_reason(request("/wrong/"))[1].encode()
-    assert found.headers["Content-Length"] == str(len(found.body))
-    assert found.headers["Content-Type"] == "text/plain"
+    assert found.headers["Content-Type"].startswith("text/plain")
 
 
 @pytest.mark.parametrize(
@@ -160,9 +159,8 @@ def test_a_denied_request_does_not_reach_the_page():
     [("", "/"), ("/", "/"), ("/a.js", "/a.js"), ("?x=1", "/?x=1"), (f"/{TOKEN}", f"/{TOKEN}")],
 )
 def test_the_page_receives_requests_without_the_token(rest, inner):
-    found, ((connection, seen),) = respond(f"/{TOKEN}{rest}", ("Accept", "text/html"))
+    found, (seen,) = respond(f"/{TOKEN}{rest}", ("Accept", "text/html"))
     assert found is None, "no response of the handler: a socket is opened"
-    assert connection == "connection"
     assert seen.path == inner
     assert list(seen.headers.raw_items()) == [("Host", HOME), ("Accept", "text/html")]
 
@@ -196,7 +194,7 @@ def test_every_response_has_the_security_headers():
 @pytest.mark.parametrize(
     ("host", "family"), [("127.0.0.1", socket.AF_INET), ("::1", socket.AF_INET6)]
 )
-def test_a_socket_is_bound_to_host_and_port(host, family):
+def test_a_socket_is_bound_to_host_and_port_with_a_random_token(host, family):
     try:
         policy = AccessPolicy.bind(host, 0, ["Lab-7", "x"])
     except OSError:
@@ -206,15 +204,11 @@ def test_a_socket_is_bound_to_host_and_port(host, family):
         assert bound.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR)
         assert bound.getsockname()[:2] == (host, policy.port)
         assert (policy.host, policy.allowed_hosts) == (host, ("lab-7", "x"))
-
-
-def test_a_policy_has_no_allowed_hosts_and_a_random_token_by_default():
-    with AccessPolicy.bind("127.0.0.1", 0).socket as bound:
-        policies = [AccessPolicy(bound, "127.0.0.1") for _ in range(2)]
-    assert [policy.allowed_hosts for policy in policies] == [(), ()]
-    assert policies[0].token != policies[1].token
-    assert policies[0].token not in repr(policies[0])
-    assert all(len(policy.token) == 32 for policy in policies)  # 24 bytes in base 64
+        other = AccessPolicy(bound, host)
+    assert other.allowed_hosts == ()
+    assert other.token != policy.token
+    assert other.token not in repr(other)
+    assert len(other.token) == 32  # 24 random bytes in base 64
 
 
 def test_a_port_in_use_raises_an_error_and_closes_the_socket(monkeypatch):
@@ -232,32 +226,28 @@ def test_a_port_in_use_raises_an_error_and_closes_the_socket(monkeypatch):
     assert made[0].fileno() == -1
 
 
-def test_an_error_restores_the_websockets_server():
+def test_an_error_restores_the_websockets_server_and_no_other_server_serves_a_page():
     original = websockets.asyncio.server.serve
 
-    def fail():
+    def fail(error=None):
         with serve_with(policy_at()):
             assert websockets.asyncio.server.serve is not original
-            raise RuntimeError("stop")
+            if error is not None:
+                raise error
 
-    with pytest.raises(RuntimeError, match="stop"):
-        fail()
-    assert websockets.asyncio.server.serve is original
-
-
-def test_no_page_is_served_by_another_server():
-    with pytest.raises(RuntimeError, match="viser started another server"), serve_with(policy_at()):
-        pass
+    for error, words in ((RuntimeError("stop"), "stop"), (None, "viser started another server")):
+        with pytest.raises(RuntimeError, match=words):
+            fail(error)
+        assert websockets.asyncio.server.serve is original
 
 
 # ------------------------------------------------------------------ a running server
 
 
 @pytest.fixture(scope="module")
-def served(body, tmp_path_factory):
+def served(body, make_page, tmp_path_factory):
     """A page for all tests, none of which changes it."""
-    folder = tmp_path_factory.mktemp("view")
-    page = Page(body, AccessPolicy.bind("127.0.0.1", 0), title="tiny", folder=folder)
+    page = make_page(body, tmp_path_factory.mktemp("view"))
     yield page
     page.close()
 
@@ -298,35 +288,29 @@ def test_the_server_follows_the_rules(policy):
         assert request_status(policy, path_, headers) == status, (path_, headers)
 
 
-def raw_response(policy, path, headers=b""):
-    """Return the head of the response to a request with these bytes."""
+def raw_status(policy, path, headers=b""):
+    """Return the status of the response to a request with these bytes."""
     with socket.create_connection(("127.0.0.1", policy.port), timeout=LONG) as call:
         host = f"Host: {home(policy)}\r\n".encode()
         call.sendall(b"GET " + path + b" HTTP/1.1\r\n" + host + headers + b"\r\n")
-        return call.recv(4096).decode("latin1").split("\r\n\r\n")[0].lower()
+        return int(call.recv(4096).decode("latin1").split()[1])
 
 
-def raw_status(*arguments):
-    return int(raw_response(*arguments).split()[1])
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        *("/\u00e9/", "/\u00e9", "/{token}\u00e9/", "/\u00e9{token}/", "/\U0001f600/", "/\udcff/"),
+def test_paths_without_the_token_or_a_file_are_denied_without_an_error(policy, capfd):
+    no_tokens = (
+        "/\u00e9/",
+        "/\u00e9",
+        "/{}\u00e9/",
+        "/\u00e9{}/",
+        "/\U0001f600/",
+        "/\udcff/",
         "/?\u00e9",
-    ],
-    ids=ascii,
-)
-def test_a_token_that_is_not_ascii_is_denied_without_an_error(policy, capfd, path):
-    path = path.format(token=policy.token)
-    assert raw_status(policy, path.encode("utf-8", "surrogateescape")) == 403
-    assert capfd.readouterr().err == ""
-
-
-@pytest.mark.parametrize("more", ["\u00e9", "%00", "%ff", "x" * 5000, "../" * 9, "%2e%2e/x"])
-def test_an_unknown_path_is_not_found_without_an_error(policy, capfd, more):
-    assert raw_status(policy, f"/{policy.token}/{more}".encode()) in (400, 404)
+    )
+    for path in no_tokens:
+        path = path.format(policy.token).encode("utf-8", "surrogateescape")
+        assert raw_status(policy, path) == 403, path
+    for more in ("\u00e9", "%00", "%ff", "x" * 5000, "../" * 9, "%2e%2e/x"):
+        assert raw_status(policy, f"/{policy.token}/{more}".encode()) in (400, 404), more
     assert capfd.readouterr().err == ""
 
 
@@ -336,12 +320,6 @@ def test_a_repeated_header_causes_no_error(policy, capfd, name):
     found = raw_status(policy, f"/{policy.token}/".encode(), twice)
     assert found == {"Host": 421, "Origin": 403, "Connection": 200}.get(name, 400)
     assert capfd.readouterr().err == ""
-
-
-def test_responses_forbid_requests_to_other_hosts(policy):
-    head = raw_response(policy, f"/{policy.token}/".encode())
-    assert "content-security-policy: default-src 'none'" in head
-    assert "access-control-allow-origin" not in head
 
 
 def test_a_browser_cannot_open_a_tunnel(served):
@@ -422,16 +400,6 @@ def test_an_invalid_message_closes_its_connection_and_prints_one_line(
     assert len(line) < MAX_CHARACTERS + 60
     others = request_status(policy, f"/{policy.token}/", {"Host": home(policy)})
     assert others == 200
-
-
-def test_repeated_invalid_messages_print_one_line(policy, failures, capfd, monkeypatch):
-    monkeypatch.setattr(policy.log, "_clock", lambda: 0.0)
-    for count in range(1, 4):
-        failures.added.clear()
-        closing_code(policy, b"\xc1")
-        assert failures.added.wait(LONG)
-        assert len(failures.all) == count
-    assert capfd.readouterr().err.count("\n") == 1
 
 
 @pytest.mark.parametrize("update", [{"value": "x"}, {"no_such_thing": 1}, {"value": None}])

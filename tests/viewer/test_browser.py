@@ -36,7 +36,7 @@ class Browser:
         self.view.on("websocket", lambda socket: self.urls.append(socket.url))
         self.view.on("pageerror", lambda error: self.errors.append(str(error)))
         self.view.on("console", self._record_error)
-        self.view.goto(page.url + "?fixedDpr=0.5")
+        self.view.goto(page._policy.url + "?fixedDpr=0.5")
         self.until(lambda: page.server.get_clients() and page.frame is not None)
         time.sleep(3)  # time of the first rendering
 
@@ -76,6 +76,14 @@ class Browser:
     def screenshot_array(self, path):
         self.view.screenshot(path=path)
         return np.asarray(Image.open(path).convert("RGB")).astype(int)[:, :800]
+
+
+@pytest.fixture
+def page(make_page, body, tmp_path):
+    page = make_page(body, tmp_path / "view")
+    page.worker.smoothing_time = 0.06
+    yield page
+    page.close()
 
 
 @pytest.fixture

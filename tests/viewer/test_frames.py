@@ -26,11 +26,10 @@ def areas(soup):
 
 
 @pytest.fixture
-def patch_load(body):
-    """A load on the tip and its frame."""
-    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
+def patch_load(body, tip):
+    """A load on the tip."""
     target = torch.tensor([0.0, 0.0, 0.2]).double()
-    return node, body.request(body.patch(node, 0.4).force_towards(target))
+    return body.request(body.patch(tip, 0.4).force_towards(target))
 
 
 @pytest.mark.parametrize(
@@ -89,14 +88,13 @@ def test_stress_at_the_surface_is_that_of_the_whole_body(body, make_scene):
         assert surface.von_mises(u, load.parameters) == pytest.approx(exact, rel=1e-12)
 
 
-def test_the_dragged_point_moves_to_the_target(body, patch_load):
-    node, request = patch_load
-    frame = body.solve(request, ViewSettings(tol=1e-8))
-    moved = frame.displacement[node] / body.scene.length
+def test_the_dragged_point_moves_to_the_target(body, patch_load, tip):
+    frame = body.solve(patch_load, ViewSettings(tol=1e-8))
+    moved = frame.displacement[tip] / body.scene.length
     assert moved[2] == pytest.approx(0.2, rel=0.25), "up to the nonlinearity of the body"
     assert abs(moved[1]) < 0.02
     assert not frame.answer.out_of_distribution
-    force = body.patch(node, 0.4).force_towards(torch.tensor([0.0, 0.0, 50.0]).double())
+    force = body.patch(tip, 0.4).force_towards(torch.tensor([0.0, 0.0, 50.0]).double())
     assert float(body.scene.loads.project(force[None])[0]) == pytest.approx(1.0), "in the range"
 
 
@@ -113,39 +111,36 @@ def test_the_amplitude_of_a_patch_load_is_that_of_the_training(body):
 
 
 def test_values_are_those_of_the_quantity(body, patch_load):
-    _, request = patch_load
     surface = body.surface
-    frame = body.solve(request, ViewSettings())
+    frame = body.solve(patch_load, ViewSettings())
     moved = frame.displacement.norm(dim=1).numpy()[surface.nodes]
     assert frame.values == pytest.approx(moved)
     assert frame.points == pytest.approx(
         surface.deformed_points(frame.displacement / body.scene.length)
     )
     settings = ViewSettings(quantity=STRESS)
-    assert body.solve(request, settings).values.max() > 0
+    assert body.solve(patch_load, settings).values.max() > 0
     assert not body.solve(body.zero_load(), settings).values.any(), "exactly zero at rest"
-    error = body.solve(request, ViewSettings(quantity=ERROR)).values
+    error = body.solve(patch_load, ViewSettings(quantity=ERROR)).values
     assert error.max() == pytest.approx(0.02 / 0.98 * moved.max(), rel=1e-4)
-    exact = body.solve(request, ViewSettings(quantity=ERROR, tol=1e-8)).values
+    exact = body.solve(patch_load, ViewSettings(quantity=ERROR, tol=1e-8)).values
     assert exact.max() < 1e-6 * moved.max()
 
 
 def test_displacements_and_stresses_scale_with_young(body, patch_load):
-    _, request = patch_load
     settings = ViewSettings(quantity=STRESS, tol=1e-8)
-    stiff = body.solve(replace(request, young=2 * request.young), settings)
-    soft = body.solve(request, settings)
+    stiff = body.solve(replace(patch_load, young=2 * patch_load.young), settings)
+    soft = body.solve(patch_load, settings)
     assert stiff.displacement.norm() < 0.7 * soft.displacement.norm()
-    bigger = replace(request, force=3 * request.force, young=3 * request.young)
+    bigger = replace(patch_load, force=3 * patch_load.force, young=3 * patch_load.young)
     bigger = body.solve(bigger, settings)
     assert bigger.values == pytest.approx(3 * soft.values, rel=1e-5)
 
 
 def test_newton_frames_start_undeformed_and_converge(body, patch_load):
-    _, request = patch_load
     settings = ViewSettings(quantity=ERROR)
-    frame = body.solve(request, settings)
-    iterates = list(body.newton_frames(request, settings, frame))
+    frame = body.solve(patch_load, settings)
+    iterates = list(body.newton_frames(patch_load, settings, frame))
     assert iterates[0].points == pytest.approx(body.surface.undeformed)
     counts = [int(state.answer.iterations) for state in iterates]
     assert counts == sorted(counts)
@@ -164,11 +159,10 @@ def test_ranges_of_moduli_are_those_of_the_scene(make_scene, make_body):
     assert make_body(make_scene(young=decades)).young == pytest.approx(1e8), "in the middle"
 
 
-def test_poissons_ratio_changes_the_solution(make_scene, make_body):
+def test_poissons_ratio_changes_the_solution(make_scene, make_body, tip):
     scene = make_scene(poisson=[0.2, 0.4])
     body: Body = make_body(scene)
-    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
-    force = body.patch(node, 0.4).force_towards(torch.tensor([0.0, 0.0, 0.1]).double())
+    force = body.patch(tip, 0.4).force_towards(torch.tensor([0.0, 0.0, 0.1]).double())
 
     def with_ratio(nu):
         return replace(body.request(force), parameters={"poisson": nu})

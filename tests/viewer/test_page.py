@@ -16,7 +16,7 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 
 from dpl.fem import SubspaceNewton, rectangle
 from dpl.inference import Simulator
-from dpl.viewer import AccessPolicy, Body, Page
+from dpl.viewer import Body
 from dpl.viewer.controls import BAD, GRASP, PULL, WARNING
 from dpl.viewer.frames import QUANTITIES
 from dpl.viewer.recording import rotating_load
@@ -29,14 +29,15 @@ BODIES = {
     "range of Poisson's ratios": {"poisson": [0.2, 0.4]},
     "range of Young's moduli": {"young": [1e6, 3e6]},
 }
+BY_USER = SimpleNamespace(client=object())
 of_bodies = partial(pytest.mark.parametrize, "pages", indirect=True)
 
 
 @pytest.fixture(scope="module", params=["hexahedra"])
-def pages(request, make_scene, make_body, tmp_path_factory):
+def pages(request, make_scene, make_body, make_page, tmp_path_factory):
     """A page of a body, and a function that restores it."""
     body, folder = make_body(make_scene(**BODIES[request.param])), tmp_path_factory.mktemp("page")
-    page = Page(body, AccessPolicy.bind("127.0.0.1", 0), title="t", folder=folder)
+    page = make_page(body, folder)
     controls, node = page.controls, page.node
     switches = (controls.mode, *controls.of_load, *controls.of_moduli)
     values = [(control, control.value) for control in (*switches, *controls.of_settings)]
@@ -48,9 +49,7 @@ def pages(request, make_scene, make_body, tmp_path_factory):
         page.node = node
         page.apply_mode()
         page.apply_settings(None)
-        page.reset(None)
-        assert page.worker.wait(240)
-        page.refresh()
+        after(page, page.reset)
 
     yield page, restore
     page.close()
@@ -72,6 +71,14 @@ def problem(page):
     return html.unescape(found[1]) if found else ""
 
 
+def after(page, action, event=None):
+    """Do an action of the page and return the frame that follows."""
+    action(event)
+    assert page.worker.wait(240)
+    page.refresh()
+    return page.frame
+
+
 def drag_tip(page, motion):
     """Send the drag events of a browser that moves the tip by a vector (3,)."""
     place = page.frame.points[page.body.surface.undeformed[:, 0].argmax()]
@@ -81,6 +88,7 @@ def drag_tip(page, motion):
         )
         asyncio.run(page.drag(event))
     assert page.worker.wait(240)
+    page.refresh()
 
 
 @of_bodies(BODIES)
@@ -141,14 +149,12 @@ def test_the_angle_rotates_a_grasped_patch(page):
     before, dim = page.frame.request, page.body.scene.problem.shape[1]
     page.controls.axis.value = "z"
     page.controls.angle.value = 6.0
-    page.apply_controls(SimpleNamespace(client=object()))
-    assert page.worker.wait(240)
+    after(page, page.apply_controls, BY_USER)
     request = page.frame.request
     turn = [np.deg2rad(6.0)] if dim == 2 else [0.0, 0.0, np.deg2rad(6.0)]
     assert request.rotation.tolist() == pytest.approx(turn)
     assert torch.equal(request.translation, before.translation)
-    page.sample(None)
-    assert page.worker.wait(240)
+    after(page, page.sample)
     assert page.frame.grasp is None
     drag_tip(page, np.array([0.0, 0.0, 0.0]))
     assert not page.frame.request.rotation.any(), "a new grasp begins without a rotation"
@@ -187,9 +193,7 @@ def test_a_change_of_the_mode_keeps_the_load(page):
     mean = frame.displacement[held].mean(dim=0)
     assert torch.allclose(page.frame.displacement[held].mean(dim=0), mean, atol=0.01)
     select(page, PULL)
-    page.reset(None)
-    assert page.worker.wait(240)
-    assert page.frame.answer.method == "rest"
+    assert after(page, page.reset).answer.method == "rest"
 
 
 def test_a_patch_that_cannot_move_is_reported_in_one_line(page):
@@ -233,8 +237,7 @@ def test_a_grasp_that_takes_too_long_is_stopped_and_reported(page, monkeypatch):
     assert problem(page).startswith("Not solved: stopped after 0.")
     page.controls.method.value = "best within the budget"
     page.controls.budget.value = 1e4
-    page.apply_settings(None)
-    assert page.worker.wait(240)
+    after(page, page.apply_settings)
     assert page.frame.answer.converged
     assert problem(page) == ""
 
@@ -267,17 +270,13 @@ def test_a_long_solve_is_reported_until_its_frame_is_shown(page, monkeypatch):
 @of_bodies(["degree 2", "2D", "range of Poisson's ratios"])
 def test_sliders_load_the_patch(page):
     page.controls.amplitude.value = 0.5
-    page.apply_controls(SimpleNamespace(client=object()))
-    assert page.worker.wait(240)
+    after(page, page.apply_controls, BY_USER)
     assert page.frame.request.force.any()
     assert page.frame.answer.amplitude == pytest.approx(0.5, abs=0.5)
-    page.sample(None)
-    assert page.worker.wait(240)
+    after(page, page.sample)
     assert not page.frame.answer.out_of_distribution
     assert page.frame.request.force[page.node].any(), "the hand moves to a loaded node"
-    page.reset(None)
-    assert page.worker.wait(240)
-    assert page.frame.answer.method == "rest"
+    assert after(page, page.reset).answer.method == "rest"
 
 
 def test_a_click_moves_the_patch_to_the_nearest_point_on_the_ray(page):
@@ -288,16 +287,13 @@ def test_a_click_moves_the_patch_to_the_nearest_point_on_the_ray(page):
 
 def test_the_amplitude_slider_follows_a_drag_and_not_itself(page):
     drag_tip(page, np.array([0.0, 0.0, 0.08]))
-    page.refresh()
     amplitude = page.frame.answer.amplitude
     assert amplitude > 0.01
     assert page.controls.amplitude.value == pytest.approx(amplitude, abs=0.01)
     direction = np.array(page.controls.direction.value)
     assert direction[2] > 0.9 * np.linalg.norm(direction)
     page.controls.amplitude.value = -0.5
-    page.apply_controls(SimpleNamespace(client=object()))
-    assert page.worker.wait(240)
-    page.refresh()
+    after(page, page.apply_controls, BY_USER)
     assert page.controls.amplitude.value == -0.5
 
 
@@ -305,18 +301,13 @@ def test_a_body_at_rest_is_neutral_and_has_no_legend(page):
     node = page._body_node
     for quantity in QUANTITIES:
         page.controls.quantity.value = quantity
-        page.apply_settings(None)
-        assert page.worker.wait(240)
-        page.refresh()
+        after(page, page.apply_settings)
         assert "on the surface" not in page.controls.readings.content
         visible = [band for band in node._meshes[:-1] if band.visible]
         assert [tuple(band.color) for band in visible] == [NEUTRAL]
     drag_tip(page, np.array([0.0, 0.0, 0.08]))
-    page.refresh()
     assert "on the surface" in page.controls.readings.content
-    page.reset(None)
-    assert page.worker.wait(240)
-    page.refresh()
+    after(page, page.reset)
     assert "on the surface" not in page.controls.readings.content
 
 
@@ -325,8 +316,7 @@ def test_the_slider_of_youngs_modulus_has_a_unit_with_prefix(page):
     slider = page.controls.young
     assert (slider.label, slider.min, slider.max, slider.value) == ("E [MPa]", 1.0, 3.0, 2.0)
     assert page.controls.modulus == 2e6
-    page.sample(None)
-    assert page.worker.wait(240)
+    after(page, page.sample)
     assert page.controls.modulus == pytest.approx(page.frame.request.young)
     page.controls.modulus = 9e9
     assert slider.value == 3.0
@@ -372,27 +362,23 @@ def test_dots_lie_above_the_surface(page):
     assert (above > np.linalg.norm(points[marker.mask] - middle, axis=1)).all()
 
 
-def test_predictions_are_corrected_in_the_modes_if_the_model_has_some(page, tmp_path):
+def test_predictions_are_corrected_in_the_modes_if_the_model_has_some(page, make_page, tmp_path):
     problem = page.body.scene.problem
     count = int(problem.free.sum())
     vectors = torch.zeros(*problem.shape, count, dtype=torch.float64)
     vectors[problem.free] = torch.eye(count).double()
     newton = SubspaceNewton(problem, vectors)
     simulator = Simulator(page.body.simulator.surrogate, newton=newton)
-    policy = AccessPolicy.bind("127.0.0.1", 0)
-    other = Page(Body(simulator), policy, title="t", folder=tmp_path)
+    other = make_page(Body(simulator), tmp_path)
     try:
-        other.sample(None)
-        assert other.worker.wait(240)
-        assert other.frame.answer.method == "corrected"
+        assert after(other, other.sample).answer.method == "corrected"
     finally:
         other.close()
 
 
 def test_no_part_of_the_path_of_a_recording_comes_from_the_browser(page):
     page._toggle_recording(None)
-    page.reset(None)
-    assert page.worker.wait(240)
+    after(page, page.reset)
     event = SimpleNamespace(client=None, target=SimpleNamespace(value="x/../../stolen.GIF"))
     with pytest.raises(KeyError):
         page._save(event)
@@ -402,9 +388,7 @@ def test_no_part_of_the_path_of_a_recording_comes_from_the_browser(page):
 def test_a_frame_that_is_not_finite_is_shown_as_invalid(page, monkeypatch):
     wrong = page.body.simulator.surrogate
     monkeypatch.setattr(wrong, "predict", lambda load: torch.full_like(load.force, torch.nan))
-    page.sample(None)
-    assert page.worker.wait(240)
-    page.refresh()
+    after(page, page.sample)
     assert "above 100 %" in page.controls.readings.content
     assert "NOT VALID" in page.controls.details.content
 

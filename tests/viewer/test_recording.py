@@ -56,10 +56,9 @@ def test_a_series_contains_forces_displacements_stresses_and_volume_ratios(
     assert path.exists()
 
 
-def test_a_series_of_a_grasp_contains_the_forces_of_the_gripper(body, tmp_path):
-    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
+def test_a_series_of_a_grasp_contains_the_forces_of_the_gripper(body, tip, tmp_path):
     motion = torch.tensor([0.0, 0.0, 0.05]).double()
-    request = body.grasp(body.patch(node, 0.3).held_nodes, motion, 0 * motion)
+    request = body.grasp(body.patch(tip, 0.3).held_nodes, motion, 0 * motion)
     frame, recording = body.solve(request, ViewSettings()), Recording(body)
     recording.start()
     recording.add(frame, 0.0)

@@ -1,8 +1,6 @@
 """Command line of the viewer and its error messages."""
 
-import os
 import re
-import signal
 import socket
 import sys
 
@@ -21,31 +19,28 @@ from dpl.viewer.page import Page
 ADDRESS = r"the page is at http://127\.0\.0\.1:\d+/[\w-]{32}/  \(Ctrl-C ends it\)\n"
 
 
-@pytest.fixture(scope="module")
-def home(start, members, tiny_training, tmp_path_factory):
-    """Working directory with a trained run, whose page was served at the end of the training."""
-    home = tmp_path_factory.mktemp("home")
-    short = ["trainer.max_epochs=1", "extras.view=true", "run=runs/a"]
-    process = start("train", *tiny_training, *short, cwd=home)
-    lines = iter(process.stdout.readline, "")
-    assert any(re.fullmatch(ADDRESS, line) for line in lines), process.stderr.read()[-2000:]
-    os.kill(process.pid, signal.SIGINT)
-    assert process.wait(timeout=240) == 130
-    assert not members(process.pid)
-    return home
+@pytest.fixture
+def home(trained_run):
+    """Working directory with the trained run runs/first."""
+    return trained_run.parents[1]
 
 
-def test_the_page_prints_its_address_and_ctrl_c_ends_it(script, home, monkeypatch):
-    assert (home / "runs/a/evaluation.json").is_file(), "the page is served at the end"
-
+def test_the_page_prints_its_address_and_ctrl_c_ends_it(
+    script, home, tiny_training, tmp_path, monkeypatch
+):
     def refresh(page):
         assert page.frame is None or page.frame.answer is not None
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Page, "refresh", refresh)
-    ended = script("view", "run=runs/a", "port=0", cwd=home)
+    ended = script("view", "run=runs/first", "port=0", cwd=home)
     assert (ended.status, ended.err) == (130, "interrupted\n")
     assert re.fullmatch(ADDRESS, ended.out)
+    short = ["trainer.max_epochs=1", "extras.view=true", "run=runs/a"]
+    ended = script("train", *tiny_training, *short, cwd=tmp_path)
+    assert ended.status == 130, ended.err[-2000:]
+    assert re.search(ADDRESS, ended.out)
+    assert (tmp_path / "runs/a/evaluation.json").is_file(), "the page is served at the end"
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
@@ -69,10 +64,10 @@ def test_a_sweep_serves_no_page(script, tiny_training, tmp_path):
     [
         (["run=runs/none"], "run = runs/none has no config.yaml; train it first"),
         ([], "run is missing; set it on the command line"),
-        (["run=runs/a", "port=70000"], "port = 70000 must lie between 0 and 65535"),
-        (["run=runs/a", "host=no.such.host.invalid"], "host = no.such.host.invalid, port = "),
-        (["run=runs/a", "hots=x"], ""),
-        (["run=runs/a", "animation=x.avi"], "animation = x.avi must end with .gif or .mp4"),
+        (["run=runs/first", "port=70000"], "port = 70000 must lie between 0 and 65535"),
+        (["run=runs/first", "host=no.such.host.invalid"], "host = no.such.host.invalid, port = "),
+        (["run=runs/first", "hots=x"], ""),
+        (["run=runs/first", "animation=x.avi"], "animation = x.avi must end with .gif or .mp4"),
     ],
     ids=str,
 )
@@ -90,7 +85,7 @@ def test_a_port_in_use_is_reported(script, home):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        ended = script("view", "run=runs/a", f"port={port}", cwd=home)
+        ended = script("view", "run=runs/first", f"port={port}", cwd=home)
     message = f"error: port = {port} is in use; choose another, or port=0 for any free port\n"
     assert (ended.status, ended.err) == (2, message)
 
@@ -100,15 +95,16 @@ def test_without_viser_the_message_names_the_extra(script, home, monkeypatch):
     for name in ("page", "nodes"):
         monkeypatch.delitem(sys.modules, f"dpl.viewer.{name}", raising=False)
     monkeypatch.delitem(vars(dpl.viewer), "Page", raising=False)
-    ended = script("view", "run=runs/a", cwd=home)
+    ended = script("view", "run=runs/first", cwd=home)
     assert ended.status == 2
     assert ended.err.endswith("pip install -c constraints.txt -e '.[viewer]'\n")
     assert ended.err.count("\n") == 1
 
 
 @pytest.mark.slow
-def test_an_animation_is_written_without_a_browser(script, home):
-    ended = script("view", "run=runs/a", "animation=films/live.gif", cwd=home)
+def test_an_animation_is_written_without_a_browser(script, home, tmp_path):
+    path = tmp_path / "films" / "live.gif"
+    ended = script("view", "run=runs/first", f"animation={path}", cwd=home)
     assert ended.status == 0, ended.err
-    image = Image.open(home / "films" / "live.gif")
+    image = Image.open(path)
     assert (image.n_frames, image.size) == (5 * FRAME_RATE, (720, 405))

@@ -42,9 +42,9 @@ def make_worker(body, shown, monkeypatch):
 
 
 @pytest.fixture
-def patch(body):
+def patch(body, tip):
     """The patch at the tip."""
-    return body.patch(int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()]), 0.3)
+    return body.patch(tip, 0.3)
 
 
 def lifted(body, patch, height):
