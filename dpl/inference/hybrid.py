@@ -11,7 +11,6 @@ from dpl.fem import (
     AndersonSolver,
     Load,
     Problem,
-    ReferenceSolver,
     Solution,
     SubspaceNewton,
     evaluate_solution,
@@ -24,8 +23,18 @@ RULES = ("natural_monotonicity", "paper")
 SECOND_CORRECTION = 0.1  # norm, over that of the displacement, that is always allowed [-]
 
 
-class Corrector(ReferenceSolver, Protocol):
+class Corrector(Protocol):
     """A Newton method that can start from a guess."""
+
+    @property
+    def problem(self) -> Problem:
+        """The body."""
+        ...
+
+    @property
+    def tol(self) -> float:
+        """Relative residual below which a solution counts as converged [-]."""
+        ...
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
         """Yield the initial state and the state after each iteration."""
