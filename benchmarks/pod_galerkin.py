@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem import LinearSolver, Problem
-from dpl.fem.rom.ecsw import Cubature, ReducedMesh, cubature, refuse_follower_loads, whitening
+from dpl.fem.rom.ecsw import Cubature, ReducedMesh, cubature, whitening
 from dpl.fem.rom.pod import pod
 from dpl.fem.solvers.newton import LoadStepping
 
@@ -102,7 +102,8 @@ class PODGalerkin:
                 f"{name} = {list(ends)} must be one number, because reduced stiffness and cells "
                 "depend on it; use Problem.with_parameters"
             )
-        refuse_follower_loads(problem, cls.__name__)
+        if problem.follower_loads:
+            raise ValueError(f"{cls.__name__} has no {problem.follower_loads.kinds}")
         snapshots = snapshots.double()
         linear = torch.zeros_like(snapshots)
         for row, u in zip(linear, snapshots, strict=True):

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 from dpl import Sample, Scene, fem
 from dpl.data import DataModule, Store
 from dpl.data.storage.integrity import verify
+from dpl.fem.assembly.follower_loads import NO_LOADS
 from dpl.fem.postprocess.energy import RestStiffness
 from dpl.inference import Simulator
 from dpl.models import FCNN, Unrolled
@@ -209,10 +210,58 @@ def test_sizes_of_loads_do_not_depend_on_follower_loads(scene):
     assert scene.loads.sizes == pytest.approx(alone.loads.sizes, rel=1e-12)
 
 
-def test_unrolled_refuses_it_by_name(name, scene):
-    kind = {"air": "follower pressure", "muscle": "active stress"}[name]
-    with pytest.raises(ValueError, match=f"has no {kind}"):
-        Unrolled(scene, rank=4, cells=4, stages=1)
+@pytest.fixture(scope="module")
+def net(scene):
+    """A model that is fitted to 40 loads, and 8 other loads."""
+    loads = [scene.loads.sample(seed, range(count)) for seed, count in ((1, 40), (2, 8), (3, 8))]
+    states = [fem.solve(scene.solver, load).displacement for load in loads]
+    fitted, held, other = (
+        Sample(load.force, u, load.young, load.parameters)
+        for load, u in zip(loads, states, strict=True)
+    )
+    net = Unrolled(scene, rank=12, cells=16, stages=2)
+    net.fit(fitted, held)
+    return net, other
+
+
+def test_unrolled_is_much_nearer_than_the_linear_solution(scene, net):
+    net, other = net
+    found = net(other.force, other.parameters) - other.displacement
+    linear = LinearBase(scene).solve(other.load) - other.displacement
+    assert found.flatten(1).norm(dim=1).mean() < 0.03 * linear.flatten(1).norm(dim=1).mean()
+
+
+def test_compiled_and_tensor_predictions_agree(net):
+    net, other = net
+    compiled = net(other.force, other.parameters)
+    tensors = net(other.force.clone().requires_grad_(), other.parameters)
+    assert_close(compiled, tensors.detach(), rtol=1e-4, atol=1e-6)
+
+
+def test_newton_in_the_modes_has_the_stiffness_of_follower_loads(scene, net):
+    """The sampled tangents of a body with and without them differ by their derivatives."""
+    net, other = net
+    correction = net.correction()
+    body = scene.problem.with_parameters(other.parameters[:1])
+    bare = replace(body, follower_loads=NO_LOADS)
+    u, white = other.displacement[0], correction.tangent.rows.T.reshape(-1, *body.shape)
+    found = correction.tangent.at(body, u) - correction.tangent.at(bare, u)
+    steps = torch.from_numpy(white).double()
+    change = body.follower_loads.force(u + 1e-4 * steps) - body.follower_loads.force(
+        u - 1e-4 * steps
+    )
+    expected = torch.einsum("ind,jnd->ij", steps, change / 2e-4)
+    assert_close(torch.from_numpy(found), (expected + expected.T) / 2, rtol=1e-4, atol=1e-6)
+
+
+def test_newton_in_the_modes_brings_predictions_closer(net):
+    net, other = net
+    guess = net(other.force, other.parameters)
+    *_, last = net.correction().iterate(other.load, guess=guess)
+    before, after = (
+        (u - other.displacement).flatten(1).norm(dim=1) for u in (guess, last.displacement)
+    )
+    assert after.mean() < before.mean()
 
 
 def everywhere(points):

@@ -38,22 +38,12 @@ class LinearBase:
 
     def solve(self, load: Load) -> Tensor:
         """Return linear solutions, (B, N, D) [-], float64, on the device of the load."""
-        problem, force = self._problem, load.force.double()
-        free = problem.free.to(force.device)
-        if problem.follower_loads.ranges:
-            count = len(problem.material.parameter_ranges)
-            stresses = load.parameters.to(force)[:, count:] / (problem.young or 1.0)
-            force = force - torch.einsum("br,rnd->bnd", stresses, self._unit_forces.to(force))
-        values = self._response(force[:, free], problem.law_parameters(load.parameters))
-        prescribed = problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
+        force, parameters = self._response.dead_loads(load.force.double(), load.parameters)
+        free = self._problem.free.to(force.device)
+        values = self._response(force[:, free], parameters)
+        prescribed = self._problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
         dofs = free.flatten().nonzero()[:, 0]
         return prescribed.index_copy(1, dofs, values).view_as(force)
-
-    @cached_property
-    def _unit_forces(self) -> Tensor:
-        """f_int at u = 0 of each follower load with a range at a stress of E, (R, N, D) [-]."""
-        problem = self._problem
-        return problem.follower_loads.unit_forces(problem.points.new_zeros(1, *problem.shape))
 
 
 def sampled_solutions(scene: Scene) -> tuple[Tensor, Tensor]:

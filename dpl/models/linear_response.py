@@ -138,6 +138,23 @@ class LinearResponse:
         forces = self.terms.support_forces()[:, self.scene.problem.free.cpu()]
         return torch.stack([self.form.parts(force).flatten() for force in forces])
 
+    def dead_loads(self, force: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """Return loads without ranged follower loads: forces (B, N, D) and parameters of the law.
+
+        The forces of follower loads on the body at rest are added to the nodal forces.
+        """
+        problem = self._scene.problem
+        if problem.follower_loads.ranges:
+            own = parameters[:, len(problem.material.parameter_ranges) :] / (problem.young or 1.0)
+            force = force - torch.einsum("br,rnd->bnd", own, self._unit_forces.to(force))
+        return force, problem.law_parameters(parameters)
+
+    @cached_property
+    def _unit_forces(self) -> Tensor:
+        """f_int at u = 0 of each follower load with a range at a stress of E, (R, N, D) [-]."""
+        problem = self._scene.problem
+        return problem.follower_loads.unit_forces(problem.points.new_zeros(1, *problem.shape))
+
     # ------------------------------------------------------------------ one load
 
     @cached_property

@@ -344,14 +344,6 @@ def test_follower_loads_need_one_modulus(grid, load):
         problem.check_modulus(40.0)
 
 
-@pytest.mark.parametrize("load", [above(1e-3), MUSCLE])
-def test_reduced_solvers_refuse_follower_loads(beam, load):
-    problem = beam(load)
-    basis = torch.zeros(*problem.shape, 1).double()
-    with pytest.raises(ValueError, match=f"has no {problem.follower_loads.kinds}"):
-        fem.SubspaceNewton(problem, basis, None)
-
-
 def test_potential_energy_needs_a_potential(beam):
     problem = beam(above(1e-3))
     load = load_of(rest(problem))

@@ -54,7 +54,7 @@ def cubature(
     cells = ReducedMesh(problem, white, numbers, torch.ones(count, dtype=torch.float64))
     rows = cells.basis.view(count, -1, vectors.shape[2])
     gram, target = torch.zeros(count, count).double(), torch.zeros(count).double()
-    body, basis = replace(problem, springs=None), white.flatten(0, 1)
+    body, basis = replace(problem, springs=None, follower_loads=NO_LOADS), white.flatten(0, 1)
     if problem.moved_supports:  # they cause forces too
         body = replace(body, free=problem.free | (problem.prescribed != 0))
     of_cells, of_body = _linear_force(cells.problem), _linear_force(body)
@@ -206,12 +206,3 @@ def whitening(problem: Problem, vectors: Tensor) -> Tensor:
     if failed:
         raise ValueError("V^T K(0) V must be positive definite; fix the rigid body modes")
     return torch.linalg.solve_triangular(lower, torch.eye(len(lower)).double(), upper=False).T
-
-
-def refuse_follower_loads(problem: Problem, name: str) -> None:
-    """Raise a ValueError if the body has follower loads; `name` cannot treat them."""
-    if problem.follower_loads:
-        raise ValueError(
-            f"{name} selects cells and has no {problem.follower_loads.kinds}; use "
-            "dpl.fem.Newton, or a model that predicts nodal displacements (fcnn, cnn, gnn)"
-        )

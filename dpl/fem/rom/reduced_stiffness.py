@@ -19,7 +19,8 @@ ReducedInverse = tuple[NDArray[np.float64], NDArray[np.float64]]
 class ReducedStiffness:
     """V^T K(0) [V, p] = sum_k a_k A_k + C, with the factors a of a law, see `StiffnessTerms`.
 
-    p is the prescribed displacement and C is that of the springs.
+    p is the prescribed displacement and C is that of the springs. The last column of C also has
+    the constant follower loads at rest, V^T f_int(0).
 
     Attributes:
         parts: A_1, ..., A_T and C, (T + 1, R, R + 1).
@@ -66,13 +67,14 @@ class ReducedStiffness:
 def reduced_terms(terms: StiffnessTerms, modes: Tensor) -> Tensor:
     """Return V^T K_k [V, p] of each term and of the springs, (T + 1, R, R + 1), of V (n, R)."""
     problem, modes, products = terms.problem, modes.double(), []
-    supports, columns = terms.support_forces()[:-1, problem.free], modes.numpy()
+    (*supports, constant), columns = terms.support_forces()[:, problem.free], modes.numpy()
     for body, moved in zip(terms.bodies, supports, strict=True):
         matrix = full_matrix(body.pattern, body.stiffness_at_rest().numpy())
         own = torch.from_numpy(columns.T @ (matrix @ columns))
         products.append(torch.cat([(own + own.T) / 2, modes.T @ moved[:, None]], 1))
     products.append(torch.zeros_like(products[0]))
     if problem.springs is not None:
-        fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])
-        products[-1] = modes.T @ problem.springs.force(fields)[:, problem.free].T
+        forces = problem.springs.force(scatter_fields(modes.T, problem.free))
+        products[-1][:, :-1] = modes.T @ forces[:, problem.free].T
+    products[-1][:, -1] = modes.T @ constant
     return torch.stack(products)

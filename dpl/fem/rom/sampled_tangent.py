@@ -28,7 +28,8 @@ class SampledTangent:
     With a cubature it is W^T K(0) W + sum_e w_e vol_e G_e^T (A(H_e) - A(0)) G_e, where H_e is the
     mean displacement gradient of the cell, G_e that of W, and A = dP/dF. The sum is zero at rest;
     only it is sampled, in float32, which suffices because W^T K W has eigenvalues close to one.
-    Without a cubature it is the tangent of the whole body.
+    Without a cubature it is the tangent of the whole body. The stiffness of follower loads is added
+    for all facets and cells under them, its symmetric part only.
 
     Attributes:
         problem: The body; its law may have ranges.
@@ -61,15 +62,21 @@ class SampledTangent:
         `whole` it sums over all cells instead of the chosen ones.
         """
         if whole or not self._has_cells:
-            tangent = problem.linearise(displacement[None]).tangent[0].numpy()
-            return self._white.T @ (full_matrix(problem.pattern, tangent) @ self._white)
+            return self._projection(problem, problem.linearise(displacement[None]).tangent[0])
         product, rank = self._moduli_change_product(problem, displacement), len(self.scale)
         change = self._basis.reshape(-1, rank).T @ product.reshape(-1, rank)
+        if problem.follower_loads:
+            stiffness, _ = problem.follower_loads.stiffness(displacement[None], problem.pattern)
+            change = change + self._projection(problem, stiffness[0])
         if not self.problem.material.parameter_ranges:
             return np.eye(rank) + change
         terms, matrices = self._terms
         factors = np.append(terms.factors(problem.material)[0].numpy(), 1.0)
         return np.tensordot(factors, matrices, 1) + change
+
+    def _projection(self, problem: Problem, entries: Tensor) -> Array:
+        """Return W^T K W of the entries (nnz,) of a matrix."""
+        return self._white.T @ (full_matrix(problem.pattern, entries.numpy()) @ self._white)
 
     def _moduli_change_product(self, problem: Problem, displacement: Tensor) -> Single:
         """Return w vol (A(H) - A(0)) G, (C, D D, R)."""

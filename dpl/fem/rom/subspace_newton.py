@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dpl.fem.options import check_options, option
 from dpl.fem.problem import Evaluation, Problem
-from dpl.fem.rom.ecsw import Cubature, cubature, refuse_follower_loads
+from dpl.fem.rom.ecsw import Cubature, cubature
 from dpl.fem.rom.sampled_tangent import Array, SampledTangent, Single
 from dpl.fem.solvers.solution import Load, Solution, check_tol, evaluate_solution, run_lockstep
 
@@ -106,7 +106,6 @@ class SubspaceNewton:
         return cls(problem, vectors, cells, **options)
 
     def __post_init__(self) -> None:
-        refuse_follower_loads(self.problem, type(self).__name__)
         check_tol(self.tol)
         check_options(self)
         found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")

@@ -10,7 +10,7 @@ from dpl.fem import InvariantBasedMaterial, SubspaceNewton, estimate_error, symm
 from dpl.fem.assembly.kernels import call_compiled
 from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.parity import Parities
-from dpl.fem.rom.ecsw import Cubature, refuse_follower_loads
+from dpl.fem.rom.ecsw import Cubature
 from dpl.fem.rom.pod import orthonormal_fields
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.symmetry import SymmetryGroup
@@ -134,7 +134,6 @@ class Unrolled(StoredBuffers):
         check_range(0, MAX_SIZE, stages=stages)
         self.scene = scene
         self.rank, self.sample_count, self.stages = rank, cells, stages
-        refuse_follower_loads(scene.problem, "model=unrolled")
         constant, problem = scene.loads.constant_force, scene.problem
         also = [] if constant is None else [constant]
         self.group = symmetries(problem, also=also) if symmetry else SymmetryGroup.identity(problem)
@@ -213,6 +212,7 @@ class Unrolled(StoredBuffers):
             if names := list(self.scene.loads.parameter_ranges):
                 raise ValueError(f"parameters are an input of this model; give {names}, (B, P)")
             parameters = force.new_zeros(force.shape[0], 0)
+        force, parameters = self.linear.dead_loads(force, parameters)
         if self._is_compiled(force, parameters):
             return self._compiled_fields(force, parameters)
         loaded, law = force.flatten(1)[:, self.dofs], self.scene.problem.material
@@ -299,7 +299,8 @@ class Unrolled(StoredBuffers):
             ValueError: There are too few samples, or they are not finite.
         """
         options = {"rank": self.rank, "cells": self.sample_count, "stages": self.stages}
-        best, every = fit_in_best_modes(self.linear, (samples, held_out), **options)
+        both = self._of_dead_loads(samples), self._of_dead_loads(held_out)
+        best, every = fit_in_best_modes(self.linear, both, **options)
         for name, buffer in best.items():
             setattr(self, name, buffer)
         self._prepare()
@@ -316,6 +317,11 @@ class Unrolled(StoredBuffers):
         columns = zip(*(fit_errors(*pair) for pair in both), strict=True)
         self.error_factors, self.error_exponents = map(torch.stack, columns)
         self.least_sizes = sizes.quantile(SMALL, dim=0).clamp(min=1e-300)
+
+    def _of_dead_loads(self, samples: Sample) -> Sample:
+        """Return samples whose nodal forces contain the follower loads at rest."""
+        force, parameters = self.linear.dead_loads(samples.force, samples.parameters)
+        return samples._replace(force=force, parameters=parameters)
 
     def correction(self) -> SubspaceNewton | None:
         if not self.newton_modes.shape[1]:
