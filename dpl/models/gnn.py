@@ -92,8 +92,8 @@ class GNN(nn.Module):
 
     def forward(self, field: Tensor, scalars: Tensor) -> Tensor:
         """Return the scaled displacement (B, N, D) of a field (B, N, D) and scalars (B, S)."""
-        loads = zip(self.levels, self.resultants(field), strict=True)
-        states = [level(*load) for level, load in loads]
+        loads = self.resultants(field)
+        states = [level(*load) for level, load in zip(self.levels, loads, strict=True)]
         if len(self.scalars) or scalars.shape[1]:  # both, or an error
             pairs = zip(states, self.scalars, strict=True)
             states = [state + encoder(scalars)[None] for state, encoder in pairs]

@@ -143,7 +143,7 @@ class LinearResponse:
 
         The forces of follower loads on the body at rest are added to the nodal forces.
         """
-        problem = self._scene.problem
+        problem = self.scene.problem
         if problem.follower_loads.ranges:
             own = parameters[:, len(problem.material.parameter_ranges) :] / (problem.young or 1.0)
             force = force - torch.einsum("br,rnd->bnd", own, self._unit_forces.to(force))
@@ -152,7 +152,7 @@ class LinearResponse:
     @cached_property
     def _unit_forces(self) -> Tensor:
         """f_int at u = 0 of each follower load with a range at a stress of E, (R, N, D) [-]."""
-        problem = self._scene.problem
+        problem = self.scene.problem
         return problem.follower_loads.unit_forces(problem.points.new_zeros(1, *problem.shape))
 
     # ------------------------------------------------------------------ one load

@@ -299,8 +299,8 @@ class Unrolled(StoredBuffers):
             ValueError: There are too few samples, or they are not finite.
         """
         options = {"rank": self.rank, "cells": self.sample_count, "stages": self.stages}
-        both = self._of_dead_loads(samples), self._of_dead_loads(held_out)
-        best, every = fit_in_best_modes(self.linear, both, **options)
+        dead = self._of_dead_loads(samples), self._of_dead_loads(held_out)
+        best, every = fit_in_best_modes(self.linear, dead, **options)
         for name, buffer in best.items():
             setattr(self, name, buffer)
         self._prepare()
