@@ -18,12 +18,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from skfem.io.meshio import to_meshio
 from torch import Tensor
 
 from dpl.export.comparison import CHECK_STREAM
 from dpl.export.onnx_graph import Array
 from dpl.fem import HasModes, Problem, evaluate_solution, solve, surface
-from dpl.fem.mesh.writing import flat_cells
+from dpl.fem.mesh.writing import with_nodes
 from dpl.fem.postprocess import triangles
 from dpl.scene import Scene
 from dpl.system.files import atomic_write
@@ -162,12 +163,12 @@ def _range(scene: Scene) -> dict[str, Any]:
 
 
 def _mesh(problem: Problem) -> dict[str, Any]:
-    kind, cells = flat_cells(problem.mesh, len(problem.points))
+    (block,) = to_meshio(with_nodes(problem.mesh, len(problem.points))).cells
     return {
         "points": problem.points_in_metres.tolist(),
-        "cell_type": kind,
+        "cell_type": block.type,
         "cell_order": "VTK",
-        "cells": cells.tolist(),
+        "cells": block.data.tolist(),
         "triangles": triangles(surface(problem.mesh)).tolist(),
     }
 

@@ -113,11 +113,10 @@ class MooneyRivlinK2(PolynomialK2):
 
     ranged: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk", "poisson")
     dimensional: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk")
-    shear_name: ClassVar[str] = "2 (c10 + c01)"
 
-    c10: Constant
-    c01: Constant
-    bulk: Constant | None = None
+    c10: Constant = option("")
+    c01: Constant = option("")
+    bulk: Constant | None = option("", default=None, above=0.0)
     poisson: Constant | None = option("", default=None, above=-1.0, below=0.5, optional=True)
 
 
@@ -135,12 +134,11 @@ class YeohK2(PolynomialK2):
 
     ranged: ClassVar[tuple[str, ...]] = ("c10", "c20", "c30", "bulk", "poisson")
     dimensional: ClassVar[tuple[str, ...]] = ("c10", "c20", "c30", "bulk")
-    shear_name: ClassVar[str] = "2 c10"
 
-    c10: Constant
-    c20: Constant
-    c30: Constant
-    bulk: Constant | None = None
+    c10: Constant = option("")
+    c20: Constant = option("")
+    c30: Constant = option("")
+    bulk: Constant | None = option("", default=None, above=0.0)
     poisson: Constant | None = option("", default=None, above=-1.0, below=0.5, optional=True)
 
 
@@ -162,11 +160,10 @@ class DemirayK2(BulkOrPoisson, InvariantBasedMaterial):
 
     ranged: ClassVar[tuple[str, ...]] = ("a", "b", "bulk", "poisson")
     dimensional: ClassVar[tuple[str, ...]] = ("a", "bulk")
-    shear_name: ClassVar[str] = "a"
 
-    a: Constant
+    a: Constant = option("", above=0.0)
     b: Constant = option("", above=0.0)
-    bulk: Constant | None = None
+    bulk: Constant | None = option("", default=None, above=0.0)
     poisson: Constant | None = option("", default=None, above=-1.0, below=0.5, optional=True)
 
     def energy(self, H: Tensor) -> Tensor:

@@ -275,27 +275,15 @@ class BulkOrPoisson(Material, Scalable):
     """Law with the volumetric term bulk/2 (J - 1)^2 and a shear modulus at rest `mu`.
 
     In place of `bulk`, Poisson's ratio at rest may be given: K = 2 mu (1 + nu) / (3 (1 - 2 nu)).
-
-    Attributes:
-        shear_name: The shear modulus at rest in terms of the constants, for a message.
     """
 
-    shear_name: ClassVar[str]
     bulk: Constant | None
     poisson: Constant | None
 
     def check_constants(self) -> None:
-        """Check that the body resists shear and compression at rest."""
-        shear, bulk = float(self.mu), float(self.bulk_modulus)
-        for name, value, why in (
-            (self.shear_name, shear, ": it is the shear modulus at rest"),
-            ("bulk", bulk, ""),
-        ):
-            if not 0 < value < math.inf:
-                raise ValueError(f"{name} = {value:g} must be above 0{why}")
-        constants = list(map(float, self.constants))
-        if not all(map(math.isfinite, constants)):
-            raise ValueError(f"moduli = {constants} must be finite numbers")
+        if not 0 < (mu := float(self.mu)) < math.inf:
+            names = ", ".join(name for name in self.dimensional if name != "bulk")
+            raise ValueError(f"{names}: the shear modulus at rest = {mu:g} must be above 0")
 
     def __post_init__(self) -> None:
         if (self.bulk is None) == (self.poisson is None):

@@ -1,5 +1,6 @@
 """Ogden's law, in principal stretches."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -30,19 +31,16 @@ class OgdenK2(BulkOrPoisson):
     """
 
     dimensional: ClassVar[tuple[str, ...]] = ("shear", "bulk")
-    shear_name: ClassVar[str] = "sum of shear"
 
     shear: Sequence[float]
     exponents: Sequence[float]
-    bulk: float | None = None
+    bulk: float | None = option("", default=None, above=0.0)
     poisson: float | None = option("", default=None, above=-1.0, below=0.5, optional=True)
 
     def check_constants(self) -> None:
-        """Check that there are as many exponents as moduli, none 0, and that the body resists."""
-        if len(self.shear) != len(self.exponents) or not all(a * a for a in self.exponents):
-            raise ValueError(
-                f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"
-            )
+        found, count = list(self.exponents), len(self.shear)
+        if len(found) != count or not all(a * a and math.isfinite(a) for a in found):
+            raise ValueError(f"exponents = {found} must be {count} numbers other than 0")
         super().check_constants()
 
     @property

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from skfem.helpers import det
 
 # Degree of exactness of the densest quadrature that `dpl.fem.assembly.elements` uses.
 ORDERS = {"Triangular": 4, "Quadrilateral": 5, "Tetrahedral": 4, "Hexahedral": 5}
@@ -75,7 +76,7 @@ def _check_volumes(mesh: skfem.Mesh) -> NDArray[np.float64]:
     """Return the orientation of each cell, (E,): 1 or -1."""
     shape = mesh.elem.refdom
     X = skfem.quadrature.get_quadrature(shape, 0 if mesh.affine else ORDERS[shape.name])[0]
-    J = _determinant(mesh.mapping().DF(X))  # (E, Q); `detDF` would raise where it is zero
+    J = det(mesh.mapping().DF(X))  # (E, Q); `detDF` would raise where it is zero
     sense = np.sign(np.median(J, axis=1))
     smallest = (J * sense[:, None]).min(axis=1)
     size = np.ptp(mesh.p[:, mesh.t], axis=1).max(axis=0)  # (E,)
@@ -86,16 +87,6 @@ def _check_volumes(mesh: skfem.Mesh) -> NDArray[np.float64]:
         if len(bad):
             raise ValueError(f"{len(bad)} cells are {flaw}: {listed(bad)}")
     return sense
-
-
-def _determinant(J: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return det J of (D, D, ...); for many small matrices much faster than `np.linalg.det`."""
-    if len(J) == 2:
-        return J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
-    return sum(
-        J[0, i] * (J[1, j] * J[2, k] - J[1, k] * J[2, j])
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))
-    )
 
 
 def _check_sides(mesh: skfem.Mesh, sense: NDArray[np.float64]) -> None:

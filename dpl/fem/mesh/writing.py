@@ -16,59 +16,24 @@ from skfem.io.meshio import to_meshio
 
 from dpl.fem.mesh.regions import group_names
 
-MIRRORED = [1, 0, 2, 3, 4, 6, 5, 8, 7, 9]  # exchange of the first two corners of a tetrahedron
-Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
 
 
-def flat_cells(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
-    """Return the type of the cells in meshio and their nodes in VTK order, (E, A), right-handed.
+def with_nodes(mesh: skfem.Mesh, nodes: int) -> skfem.Mesh:
+    """Return a mesh with right-handed tetrahedra whose number of nodes is `nodes`.
 
-    They are quadratic cells if `nodes` is the number of their nodes, not of those of the mesh.
+    Its cells are quadratic, as in `Problem`, if the given mesh has another number of nodes.
     """
-    (block,) = to_meshio(_with_nodes(mesh, nodes), encode_cell_data=False).cells
-    left, cells = _left_handed(mesh), block.data.copy()
-    if left.any():
-        cells[left] = cells[left][:, MIRRORED[: cells.shape[1]]]
-    return block.type, cells
-
-
-def _left_handed(mesh: skfem.Mesh) -> NDArray[np.bool_]:
-    """Return a mask of the left-handed tetrahedra, (E,)."""
-    if mesh.elem.refdom.name != "Tetrahedral":
-        return np.zeros(mesh.nelements, dtype=bool)
-    corners = mesh.p.T[mesh.t[:4].T]
-    return np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
-
-
-def _tags(mesh: skfem.Mesh) -> dict[str, list[Array]]:
-    """Return `group_names` of a body as cell data, facets numbered as by `flat_cells`.
-
-    A set of facets is stored as one bit per facet of each cell. An exchange of the first two
-    corners of a tetrahedron exchanges its last two facets.
-    """
-    shown, tags = group_names(mesh), {}
-    for name, (bits,) in to_meshio(mesh).cell_data.items():
-        if name.partition(":")[2].partition(":")[2] not in shown:
-            continue
-        tags[name] = [bits]
-        if name.startswith("skfem:b:"):
-            whole = np.asarray(bits).astype(np.int64)
-            change = (whole >> 3 ^ whole >> 2) & _left_handed(mesh)
-            tags[name] = [(whole ^ (change << 3 | change << 2)).astype(bits.dtype)]
-    return tags
-
-
-def _with_nodes(mesh: skfem.Mesh, nodes: int) -> skfem.Mesh:
-    """Return the mesh with a number of nodes, perhaps of quadratic cells as in `Problem`."""
     name = type(mesh).__name__
     if nodes != mesh.p.shape[1] and name.endswith("1"):
+        facets, cells = mesh.boundaries or {}, mesh.subdomains or {}
         mesh = getattr(skfem, f"{name[:-1]}2").from_mesh(mesh)
+        mesh = mesh.with_boundaries(facets).with_subdomains(cells)
     if nodes != mesh.p.shape[1]:
         raise ValueError(
             f"fields = arrays of {nodes} nodes must have those of the mesh ({mesh.p.shape[1]})"
         )
-    return mesh
+    return mesh.oriented() if mesh.elem.refdom.name == "Tetrahedral" else mesh
 
 
 def _to_meshio(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
@@ -77,10 +42,12 @@ def _to_meshio(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
     if others:
         counts = ", ".join(map(str, [nodes, *others]))
         raise ValueError(f"fields = arrays of {counts} nodes must be equally long")
-    kind, cells = flat_cells(mesh, nodes)
-    points = _spatial(_with_nodes(mesh, nodes).p.T)
-    data = {name: _spatial(field) for name, field in fields.items()}
-    return meshio.Mesh(points, [(kind, cells)], point_data=data, cell_data=_tags(mesh))
+    shown, body = group_names(mesh), to_meshio(with_nodes(mesh, nodes))
+    body.points = _spatial(body.points)
+    body.point_data = {name: _spatial(field) for name, field in fields.items()}
+    tags = body.cell_data.items()
+    body.cell_data = {key: bits for key, bits in tags if key.split(":", 2)[-1] in shown}
+    return body
 
 
 def _spatial(field: Array) -> Array:
