@@ -49,8 +49,6 @@ class Heterogeneous(Material):
     def finite(self) -> bool:  # type: ignore[override]
         return all(law.finite for law in self.laws.values())
 
-    # ------------------------------------------------------------------ cells
-
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
         count = basis.mesh.nelements
         index = np.full(count, -1)
@@ -115,8 +113,6 @@ class Heterogeneous(Material):
             for numbers, cells in self._layout.groups
         ]
 
-    # ------------------------------------------------------------------ parameters
-
     @property
     def parts(self) -> Mapping[str, Material]:
         return self.laws
@@ -136,8 +132,6 @@ class Heterogeneous(Material):
 
     def describe(self) -> str:
         return "; ".join(f"{name}: {law.describe()}" for name, law in self.laws.items())
-
-    # ------------------------------------------------------------------ evaluation
 
     @property
     def has_response(self) -> bool:

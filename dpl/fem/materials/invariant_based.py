@@ -17,6 +17,8 @@ from dpl.fem.materials.tensors import (
     with_axes,
 )
 
+Derivatives = tuple[Any, ...]  # see `InvariantBasedMaterial.invariant_derivatives`
+
 
 class InvariantBasedMaterial(Material):
     """Law of the invariants, W(I1, I2, J) of C = F^T F, with its `invariant_derivatives`.
@@ -34,9 +36,7 @@ class InvariantBasedMaterial(Material):
         return CompiledForm(self)
 
     @staticmethod
-    def invariant_derivatives(
-        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
-    ) -> tuple[Any, ...]:
+    def invariant_derivatives(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> Derivatives:
         """Return (rest, W2, p, W11, W12, W22, J W1J, J W2J, J p_J).
 
         Indices are derivatives, p = J W_J, and rest = p + 2 W1 + 4 W2, which is zero at rest and
@@ -81,7 +81,7 @@ class InvariantBasedMaterial(Material):
         S, _ = self._stress(2 * green_lagrange(H), volume_change(H))
         return S + H @ S
 
-    def _stress(self, e: Tensor, j: Tensor) -> tuple[Tensor, tuple[Any, ...]]:
+    def _stress(self, e: Tensor, j: Tensor) -> tuple[Tensor, Derivatives]:
         """Return S (..., 3, 3) at e = C - I where J = 1 + j, and the derivatives that make it."""
         i1, second, square = invariants(e)
         log_j = torch.log1p(j)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.materials.arithmetic import exp
-from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.invariant_based import Derivatives, InvariantBasedMaterial
 from dpl.fem.materials.material import BulkOrPoisson
 from dpl.fem.materials.parameters import Constant
 from dpl.fem.materials.tensors import green_lagrange, invariants, volume_change
@@ -17,14 +17,10 @@ from dpl.fem.options import option
 
 def isochoric_derivatives(
     f1: Any, f11: Any, f2: Any, i1: Any, i2: Any, m1: Any, volumetric: tuple[Any, Any]
-) -> tuple[Any, ...]:
+) -> Derivatives:
     """Return `invariant_derivatives` of f(x) + f2 y + U(J), x = Ib1 - 3 and y = Ib2 - 3.
 
-    Args:
-        f1, f11: f' and f''.
-        f2: Factor of y.
-        i1, i2, m1: As in `InvariantBasedMaterial.invariant_derivatives`.
-        volumetric: J U' and J (J U')'.
+    f1 and f11 are f' and f'', and `volumetric` is J U' and J (J U')'.
     """
     q, qJ = volumetric
     m = 1 + m1
@@ -40,11 +36,8 @@ def isochoric_derivatives(
 
 def polynomial_derivatives(
     c: Any, i1: Any, i2: Any, m1: Any, volumetric: tuple[Any, Any]
-) -> tuple[Any, ...]:
-    """Return `invariant_derivatives` of c0 x + c1 x^2 + c2 x^3 + c3 y + U(J).
-
-    Arguments are those of `isochoric_derivatives`, c are moduli.
-    """
+) -> Derivatives:
+    """Return `isochoric_derivatives` of c0 x + c1 x^2 + c2 x^3 + c3 y + U(J)."""
     x = (1 + m1) * i1 + 3 * m1
     f1, f11 = c[0] + x * (2 * c[1] + 3 * c[2] * x), 2 * c[1] + 6 * c[2] * x
     return isochoric_derivatives(f1, f11, c[3], i1, i2, m1, volumetric)
@@ -74,9 +67,7 @@ class PolynomialMaterial(InvariantBasedMaterial):
         return i1 * (c10 + i1 * (c20 + i1 * c30)) + c01 * i2 + bulk / 2 * j.square()
 
     @staticmethod
-    def invariant_derivatives(
-        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
-    ) -> tuple[Any, ...]:
+    def invariant_derivatives(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> Derivatives:
         return polynomial_derivatives(c, i1, i2, m1, k2_derivatives(c[4], j))
 
 
@@ -181,8 +172,6 @@ class DemirayK2(BulkOrPoisson, InvariantBasedMaterial):
         return self.value("a")
 
     @staticmethod
-    def invariant_derivatives(
-        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
-    ) -> tuple[Any, ...]:
+    def invariant_derivatives(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> Derivatives:
         f1 = c[0] * exp(c[1] * ((1 + m1) * i1 + 3 * m1))
         return isochoric_derivatives(f1, c[1] * f1, 0.0, i1, i2, m1, k2_derivatives(c[2], j))

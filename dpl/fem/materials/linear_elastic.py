@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.invariant_based import Derivatives, InvariantBasedMaterial
 from dpl.fem.materials.material import YoungPoissonMaterial
 from dpl.fem.materials.tensors import dyad, green_lagrange, symmetric_product, trace, with_axes
 
@@ -20,9 +20,7 @@ class Hookean(InvariantBasedMaterial):
         return self.lam, self.mu
 
     @staticmethod
-    def invariant_derivatives(
-        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
-    ) -> tuple[Any, ...]:
+    def invariant_derivatives(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> Derivatives:
         rest = (c[0] / 2 + c[1]) * i1
         return rest, -c[1] / 2, 0.0, c[0] / 4 + c[1] / 2, 0.0, 0.0, 0.0, 0.0, 0.0
 

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.invariant_based import Derivatives, InvariantBasedMaterial
 from dpl.fem.materials.isochoric import (
     PolynomialMaterial,
     isochoric_invariants,
@@ -34,9 +34,7 @@ class NeoHookeanLn(YoungPoissonMaterial, InvariantBasedMaterial):
         return self.lam, self.mu
 
     @staticmethod
-    def invariant_derivatives(
-        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
-    ) -> tuple[Any, ...]:
+    def invariant_derivatives(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> Derivatives:
         rest = c[0] * log_j
         return rest, 0.0, rest - c[1], 0.0, 0.0, 0.0, 0.0, 0.0, c[0]
 
@@ -66,9 +64,7 @@ class NeoHookeanIsoK4(NeoHookeanIsoK2):
         return self.mu / 2 * i1 + self.bulk_modulus / 4 * (j * (2 + j) - 2 * torch.log1p(j))
 
     @staticmethod
-    def invariant_derivatives(
-        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
-    ) -> tuple[Any, ...]:
+    def invariant_derivatives(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> Derivatives:
         return polynomial_derivatives(c, i1, i2, m1, k4_derivatives(c[4], j))
 
 
@@ -95,9 +91,7 @@ class StableNeoHookean(YoungPoissonMaterial, InvariantBasedMaterial):
         return 4 / 3 * self.mu, self.lam + 5 / 6 * self.mu
 
     @staticmethod
-    def invariant_derivatives(
-        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
-    ) -> tuple[Any, ...]:
+    def invariant_derivatives(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> Derivatives:
         near = 1 / (4 + i1)
         J = 1 + j
         volume = c[1] * j * J - 3 / 4 * c[0] * j

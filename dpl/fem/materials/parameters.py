@@ -110,11 +110,7 @@ class Parametrised:
         """
 
     def value(self, name: str) -> Tensor:
-        """Return a constant in float64, see the class; moduli over Young's modulus of the scene.
-
-        Raises:
-            ValueError: It is a range, or a field whose values are not known before `on`.
-        """
+        """Return a constant in float64, see the class; moduli over Young's modulus of the scene."""
         value = self.given(name)
         return value * self.unit if name in self.dimensional else value
 
@@ -248,9 +244,6 @@ class Parametrised:
             parameters: Values in the order of `parameter_ranges`, (B, P). With B > 1, or if they
                 require a gradient, each member of a batch has its own, and the law takes strains
                 (B, E, Q, 3, 3).
-
-        Raises:
-            ValueError: The law has another number of ranges, or does not allow a value.
         """
         names = list(self.parameter_ranges)
         if parameters.shape[-1] != len(names):

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.invariant_based import Derivatives, InvariantBasedMaterial
 from dpl.fem.materials.parameters import Constant, Scalable
 from dpl.fem.materials.tensors import volume_change
 from dpl.fem.options import option
@@ -49,9 +49,7 @@ class VolumetricK2(InvariantBasedMaterial, Scalable):
         return self.value("bulk")
 
     @staticmethod
-    def invariant_derivatives(
-        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
-    ) -> tuple[Any, ...]:
+    def invariant_derivatives(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> Derivatives:
         p, pJ = k2_derivatives(c[0], j)
         return p, 0.0, p, 0.0, 0.0, 0.0, 0.0, 0.0, pJ
 
@@ -68,8 +66,6 @@ class VolumetricK4(VolumetricK2):
         return self.value("bulk") / 4 * (j * (2 + j) - 2 * torch.log1p(j))
 
     @staticmethod
-    def invariant_derivatives(
-        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
-    ) -> tuple[Any, ...]:
+    def invariant_derivatives(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> Derivatives:
         p, pJ = k4_derivatives(c[0], j)
         return p, 0.0, p, 0.0, 0.0, 0.0, 0.0, 0.0, pJ

@@ -28,7 +28,6 @@ CELLS = {  # supported types of cells in meshio: dimension, nodes
     "triangle": (2, 3),
     "triangle6": (2, 6),
 }
-Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
 
 
@@ -54,14 +53,8 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> skfem.Mesh:
             ...). The file need not be trusted, see `dpl.fem.mesh.sandbox`.
         scale: Unit of its coordinates [m]: 1e-3 for millimetres.
 
-    Raises:
-        FileNotFoundError: There is no such file.
-        MemoryError: The mesh would not fit in memory.
-        ValueError: The file cannot be read, or its mesh is invalid. Messages number nodes as the
-            file lists them, from 0, and cells in the same way among those that are kept.
-
-    Warns:
-        UserWarning: Nodes are dropped, or the node order of cells is inverted.
+    Errors number nodes as the file lists them, from 0, and cells in the same way among those that
+    are kept. A warning says which nodes are dropped and which cells are reordered.
     """
     path = Path(path)
     if not 0 < scale < math.inf:
@@ -82,31 +75,24 @@ def read_cell_data(path: str | Path, names: Sequence[str]) -> list[Array]:
     Args:
         path: The file, which need not be trusted, see `dpl.fem.mesh.sandbox`.
         names: Names of the fields.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file cannot be read, or has no such field with a row for each cell.
     """
-    raw = read(Path(path))
+    raw, fields = read(Path(path)), []
     with named_errors(f"{path}: "):
         kind = _cell_type(raw)
-        return [_cell_field(raw, kind, name) for name in names]
-
-
-def _cell_field(raw: meshio.Mesh, kind: str, name: str) -> Array:
-    """Return a field on the cells of one type, (E,) or (E, components)."""
-    if name not in raw.cell_data:
-        known = ", ".join(map(repr, sorted(raw.cell_data)[:20])) or "none"
-        raise ValueError(f"has no cell data {name!r}; there are: {known}")
-    parts = [
-        np.asarray(values, dtype=np.float64)
-        for block, values in zip(raw.cells, raw.cell_data[name], strict=False)
-        if block.type == kind
-    ]
-    cells = sum(len(block.data) for block in raw.cells if block.type == kind)
-    if len({part.shape[1:] for part in parts}) != 1 or sum(map(len, parts)) != cells:
-        raise ValueError(f"cell data {name!r} must have one row for each of {cells} cells")
-    return np.concatenate(parts)
+        cells = sum(len(block.data) for block in raw.cells if block.type == kind)
+        for name in names:
+            if name not in raw.cell_data:
+                known = ", ".join(map(repr, sorted(raw.cell_data)[:20])) or "none"
+                raise ValueError(f"has no cell data {name!r}; there are: {known}")
+            parts = [
+                np.asarray(values, dtype=np.float64)
+                for block, values in zip(raw.cells, raw.cell_data[name], strict=False)
+                if block.type == kind
+            ]
+            if len({part.shape[1:] for part in parts}) != 1 or sum(map(len, parts)) != cells:
+                raise ValueError(f"cell data {name!r} must have one row for each of {cells} cells")
+            fields.append(np.concatenate(parts))
+    return fields
 
 
 def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
@@ -121,8 +107,15 @@ def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
     cells = np.concatenate([block.data for block in raw.cells if block.type == kind])
     if cells.dtype.kind not in "iu":
         raise ValueError("cell connectivity must contain integers")
-    cells = cells.astype(np.int64)
-    _check_range(cells, len(points))
+    cells, nodes = cells.astype(np.int64), len(points)
+    low, high = cells.min(), cells.max()
+    if low < 0 or high >= nodes:
+        guess = "; does the numbering start at 1?" if (low, high) == (1, nodes) else ""
+        bad = np.flatnonzero(((cells < 0) | (cells >= nodes)).any(axis=1))
+        raise ValueError(
+            f"node numbers of cells = {low} to {high} must be between 0 and {nodes - 1}{guess} "
+            f"({len(bad)} such cells: {listed(bad)})"
+        )
     used, compact = np.unique(cells, return_inverse=True)
     refuse_mesh(len(used), "its size")
     compact, unused = compact.reshape(-1, width), len(points) - len(used)
@@ -178,14 +171,3 @@ def _repairs(shape: type[Refdom], nodes: Array, unused: int) -> list[str]:
     if unused:
         repairs.append(f"{unused} nodes belong to no cell; they are dropped")
     return repairs
-
-
-def _check_range(cells: Numbers, nodes: int) -> None:
-    low, high = cells.min(), cells.max()
-    if low < 0 or high >= nodes:
-        guess = "; does the numbering start at 1?" if (low, high) == (1, nodes) else ""
-        bad = np.flatnonzero(((cells < 0) | (cells >= nodes)).any(axis=1))
-        raise ValueError(
-            f"node numbers of cells = {low} to {high} must be between 0 and {nodes - 1}{guess} "
-            f"({len(bad)} such cells: {listed(bad)})"
-        )

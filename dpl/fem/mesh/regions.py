@@ -163,9 +163,6 @@ def nodes_in(
             faces and cells.
         scale: Length unit of the mesh of the basis [m].
         origin: Origin of that mesh in its own unit, (D,).
-
-    Raises:
-        ValueError: The region contains no node, or the group does not exist.
     """
     region = Tag(region) if isinstance(region, str) else region
     if isinstance(region, Tag):
@@ -188,7 +185,7 @@ def facets_in(
     """Return the numbers of the boundary facets in a region, ascending.
 
     A region contains the facets whose vertices all lie inside. A group contains its facets, or
-    those whose vertices all belong to its cells. For arguments and errors see `nodes_in`.
+    those whose vertices all belong to its cells. For arguments see `nodes_in`.
     """
     region, boundary = Tag(region) if isinstance(region, str) else region, mesh.boundary_facets()
     if not isinstance(region, Tag):
@@ -210,7 +207,7 @@ def cells_in(
     """Return the numbers of the cells in a region, ascending.
 
     A region contains the cells whose centres, the means of the vertices, lie inside. A group
-    contains its cells; one of facets is an error. For arguments and other errors see `nodes_in`.
+    contains its cells; one of facets is an error. For arguments see `nodes_in`.
     """
     region = Tag(region) if isinstance(region, str) else region
     if isinstance(region, Tag):

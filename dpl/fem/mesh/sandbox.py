@@ -10,7 +10,6 @@ import json
 import math
 import os
 import signal
-import stat
 import subprocess
 import sys
 import zipfile
@@ -63,20 +62,18 @@ def read(path: Path) -> meshio.Mesh:
 
 def _size(path: Path) -> int:
     """Return the size of a regular file [B]."""
-    try:
-        found = path.stat()
-    except (OSError, ValueError):
-        raise FileNotFoundError(f"{path}: no such mesh file") from None
-    if stat.S_ISDIR(found.st_mode):
+    if os.path.isdir(path):
         raise FileNotFoundError(f"{path}: is a folder, not a mesh file")
-    if not stat.S_ISREG(found.st_mode):
+    if not os.path.exists(path):
+        raise FileNotFoundError(f"{path}: no such mesh file")
+    if not os.path.isfile(path):
         raise ValueError(f"{path}: is a device or a pipe; copy its data into a file")
-    if found.st_size > MAX_BYTES:
+    size, limit = path.stat().st_size, MAX_BYTES // 2**30
+    if size > MAX_BYTES:
         raise ValueError(
-            f"{path}: size = {found.st_size / 2**30:.1f} GiB must be at most "
-            f"{MAX_BYTES / 2**30:.0f} GiB; split the mesh"
+            f"{path}: size = {size / 2**30:.1f} GiB must be at most {limit} GiB; split the mesh"
         )
-    return found.st_size
+    return size
 
 
 def _decode(value: Any, arrays: Any) -> Any:

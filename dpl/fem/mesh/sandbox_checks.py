@@ -95,7 +95,10 @@ def _check_gmsh(data: bytes) -> None:
             if form[2] == b"0":
                 rows = [row.split() for row in sections[0].splitlines() if row.strip()]
             else:
-                rows = (_binary_rows2 if form[1] < b"3" else _binary_rows4)(name, sections[0])
+                unpack = _binary_rows2 if form[1] < b"3" else _binary_rows4
+                rows, end = unpack(name, sections[0])
+                if not 0 <= len(sections[0]) - end <= 2:  # an end of line
+                    raise IndexError
             _check_rows(name, rows, blocks=form[1] > b"3")
         except (KeyError, IndexError, struct.error):
             raise Refused(f"${name} holds more or fewer rows than it declares") from None
@@ -126,8 +129,8 @@ def _check_rows(name: str, rows: list[Any], *, blocks: bool) -> None:
         _check_unique(first)
 
 
-def _binary_rows4(name: str, data: bytes) -> list[Any]:
-    """Return the rows that a section of version 4.1 would have as text, coordinates empty."""
+def _binary_rows4(name: str, data: bytes) -> tuple[list[Any], int]:
+    """Return the rows of a section of version 4.1 as in text, coordinates empty, and its length."""
     rows: list[Any] = [struct.unpack_from("=4Q", data)]
     place = 32
     for _ in range(rows[0][0]):
@@ -140,30 +143,24 @@ def _binary_rows4(name: str, data: bytes) -> list[Any]:
         if name == "Nodes":
             rows += [()] * count
             place += 24 * count
-    return _ended(rows, data, place)
+    return rows, place
 
 
-def _binary_rows2(name: str, data: bytes) -> list[Any]:
-    """Return the rows that a section of version 2 would have as text, without coordinates."""
+def _binary_rows2(name: str, data: bytes) -> tuple[list[Any], int]:
+    """Return the rows of a section of version 2 as in text, no coordinates, and its length."""
     place = data.index(b"\n") + 1
     rows: list[Any] = [(int(data[:place]),)]
     if name == "Nodes":
         kind = np.dtype([("number", "=i4"), ("point", "=f8", 3)])
         found = np.frombuffer(data[place : place + 28 * rows[0][0]], kind)
-        return _ended([*rows, *found["number"][:, None].tolist()], data, place + found.nbytes)
+        return [*rows, *found["number"][:, None].tolist()], place + found.nbytes
     while len(rows) <= rows[0][0]:
         kind, count, tags = struct.unpack_from("=3i", data, place)
         width = 1 + tags + GMSH_NODES[kind]
         block = np.frombuffer(data[place + 12 : place + 12 + 4 * count * width], "=i4")
         rows += [[n[0], kind, tags, *n[1:]] for n in block.reshape(-1, width).tolist()]
         place += 12 + block.nbytes
-    return _ended(rows, data, place)
-
-
-def _ended(rows: list[Any], data: bytes, place: int) -> list[Any]:
-    if not 0 <= len(data) - place <= 2:  # an end of line
-        raise IndexError
-    return rows
+    return rows, place
 
 
 def read_vtu(path: Path) -> meshio.Mesh:

@@ -91,15 +91,13 @@ def write_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Arra
 
     Writes one VTU file per load, their collection `NAME.pvd`, and `NAME.xdmf` with all loads. If
     h5py is installed, `NAME.vtkhdf` has all loads too, and the numbers of `NAME.xdmf` are in
-    `NAME.h5`. The time is the index of the load.
+    `NAME.h5`. The time is the index of the load. Returns the paths of the PVD, XDMF and VTKHDF
+    files.
 
     Args:
         path: Folder and NAME; the folder is created.
         mesh: The body [m].
         steps: Fields of each load as in `write_mesh`.
-
-    Returns:
-        Paths of the PVD, XDMF and, with h5py, VTKHDF files.
     """
     names = [f"{path.name}_{k:03d}.vtu" for k in range(len(steps))]
     bodies = [_to_meshio(mesh, fields) for fields in steps]

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.linear.interface import full_matrix
@@ -41,12 +40,8 @@ class RestStiffness:
         """
         problem = self.problem
         if parameters is None or not problem.material.parameter_ranges:
-            free, image = problem.free, torch.zeros_like(field)
-            columns = field.detach()[:, free].T
-            if field.device.type == "cpu":
-                image[:, free] = torch.from_numpy(self._matrix @ columns.numpy()).T
-            else:
-                image[:, free] = (self._on_device @ columns).T
+            image = torch.zeros_like(field)
+            image[:, problem.free] = (self._matrix @ field.detach()[:, problem.free].T).T
             return image
         law = problem.material.with_parameters(problem.law_parameters(parameters))
         terms, bodies = self._terms
@@ -99,13 +94,9 @@ class RestStiffness:
         return LinearSolver(self.problem if on_cpu else self.problem.to("cpu"))
 
     @cached_property
-    def _matrix(self) -> csr_array:
-        problem = self._linear.problem
-        return full_matrix(problem.pattern, problem.stiffness_at_rest().numpy())
-
-    @cached_property
-    def _on_device(self) -> Tensor:
-        whole, device = self._matrix, self.problem.points.device
+    def _matrix(self) -> Tensor:
+        problem, device = self._linear.problem, self.problem.points.device
+        whole = full_matrix(problem.pattern, problem.stiffness_at_rest().numpy())
         rows, columns, values = map(torch.from_numpy, (whole.indptr, whole.indices, whole.data))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # sparse matrices of torch are in beta state
@@ -121,10 +112,7 @@ def potential_energy(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return W(u) - W(0) - f.u (B,), its gradient (B, N, D), and a mask of det F > 0 (B,).
 
-    W includes the potential of follower loads.
-
-    Raises:
-        ValueError: A follower pressure has no potential.
+    W includes the potential of follower loads, which must have one.
     """
     if not problem.has_potential:
         raise ValueError(

@@ -137,17 +137,25 @@ class LaplaceFibres(FibreDirections):
         _unit_vectors("longitudinal", np.array([self.longitudinal]))
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        surfaces = [
+        inner, outer = (
             basis.get_dofs(facets_in(part, basis.mesh, length, origin)).all()
             for part in (self.inner, self.outer)
-        ]
-        depth, gradient = _laplace(basis, *surfaces)
+        )
+        if len(both := np.intersect1d(inner, outer)):
+            raise ValueError(f"inner and outer must not touch; they share {len(both)} nodes")
+        values, held = np.zeros(basis.N), np.concatenate([inner, outer])
+        values[outer] = 1.0
+        system = skfem.condense(laplace.assemble(basis), x=values, D=held)
+        depth = basis.interpolate(skfem.solve(*system, solver=solver_iter_pcg(rtol=LAPLACE_TOL)))
+        gradient = np.moveaxis(depth.grad, 0, -1)
         transmural = _unit_vectors("gradient between inner and outer", gradient)
         around = np.cross(_unit_vectors("longitudinal", np.array([self.longitudinal])), transmural)
         parallel = np.linalg.norm(around, axis=-1) < PARALLEL
         _refuse(parallel, "longitudinal must not be parallel to the transmural direction")
         around = _unit_vectors("circumferential direction", around)
-        angle = (self.inner_angle + (self.outer_angle - self.inner_angle) * depth)[..., None]
+        angle = (self.inner_angle + (self.outer_angle - self.inner_angle) * np.asarray(depth))[
+            ..., None
+        ]
         fibre = np.cos(angle) * around + np.sin(angle) * np.cross(transmural, around)
         return frames_of(fibre, transmural)
 
@@ -207,19 +215,3 @@ def _refuse(bad: NDArray[np.bool_], message: str) -> None:
     if bad.any():
         cells = np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))
         raise ValueError(message + (f" (cells {listed(cells)})" if len(bad) > 1 else ""))
-
-
-def _laplace(
-    basis: skfem.Basis, inner: NDArray[np.int_], outer: NDArray[np.int_]
-) -> tuple[Array, Array]:
-    """Return the solution of Laplace's equation (E, Q) [-] and its gradient (E, Q, D) at points.
-
-    It is 0 and 1 at the degrees of freedom `inner` and `outer` of the scalar basis.
-    """
-    if len(both := np.intersect1d(inner, outer)):
-        raise ValueError(f"inner and outer must not touch; they share {len(both)} nodes")
-    values = np.zeros(basis.N)
-    values[outer] = 1.0
-    system = skfem.condense(laplace.assemble(basis), x=values, D=np.concatenate([inner, outer]))
-    field = basis.interpolate(skfem.solve(*system, solver=solver_iter_pcg(rtol=LAPLACE_TOL)))
-    return np.asarray(field), np.moveaxis(field.grad, 0, -1)

@@ -72,8 +72,21 @@ class FibreReinforced(Material):
         ):
             name = type(self.matrix).__name__
             raise ValueError(f"matrix = {name} must be a law of the invariants for finite strains")
-        if isinstance(self.directions, Tensor) and not torch.compiler.is_compiling():
-            _check_frames(self.directions)
+        frames = self.directions
+        if not isinstance(frames, Tensor) or torch.compiler.is_compiling():
+            return
+        if frames.dim() not in (3, 4) or frames.shape[-2:] != (3, 3) or not frames.numel():
+            raise ValueError(
+                f"directions of shape {tuple(frames.shape)} must have (cells, 3, 3) or "
+                "(cells, points, 3, 3)"
+            )
+        gap = frames.mT @ frames - torch.eye(3, dtype=frames.dtype, device=frames.device)
+        bad = ~(gap.abs().flatten(1).amax(1) <= ORTHONORMAL)
+        if bad.any():
+            raise ValueError(
+                f"directions must have orthonormal columns; in {int(bad.sum())} of {len(frames)} "
+                "cells they do not"
+            )
 
     @property
     def finite(self) -> bool:  # type: ignore[override]
@@ -104,14 +117,14 @@ class FibreReinforced(Material):
     def centred(self) -> Self:
         """Return the law with the rotation next to the mean of the frames of each cell."""
         law = super().centred()
-        if self.frames.ndim == 3:
+        if self.frames.shape[1] == 1:
             return law
         U, _, V = torch.linalg.svd(self.frames.mean(1))
         return replace(law, directions=U @ V)
 
     @property
     def compiled_form(self) -> CompiledForm:
-        return CompiledForm(self.matrix, self.fibres, self.frames_of_points)
+        return CompiledForm(self.matrix, self.fibres, self.frames)
 
     @property
     def constants(self) -> tuple[Any, ...]:
@@ -119,15 +132,14 @@ class FibreReinforced(Material):
 
     @property
     def frames(self) -> Tensor:
-        """Fibre frames (E, Q, 3, 3), (E, 3, 3) or (1, 3, 3) [-]."""
-        if isinstance(self.directions, Tensor):
-            return self.directions
-        if (frames := self.directions.constant()) is None:
+        """Fibre frames, (E or 1, Q or 1, 3, 3) [-]."""
+        given = self.directions
+        if (frames := given if isinstance(given, Tensor) else given.constant()) is None:
             raise ValueError(
-                f"directions = {type(self.directions).__name__} must be evaluated on a body first; "
+                f"directions = {type(given).__name__} must be evaluated on a body first; "
                 "call FibreReinforced.on"
             )
-        return frames
+        return frames if frames.ndim == 4 else frames[:, None]
 
     def energy(self, H: Tensor) -> Tensor:
         Q = self._rotation(H)
@@ -191,14 +203,9 @@ class FibreReinforced(Material):
         S = (D @ strain.flatten(-2)[..., None])[..., 0].unflatten(-1, (3, 3))
         return self.matrix.rest_stress(H) + Q @ S @ Q.mT
 
-    @property
-    def frames_of_points(self) -> Tensor:
-        """Frames, (E or 1, Q or 1, 3, 3) [-]."""
-        return self.frames if self.frames.ndim == 4 else self.frames[:, None]
-
     def _rotation(self, H: Tensor) -> Tensor:
         """Return the frames of the points as H, (E, Q or 1, 3, 3), or (3, 3) if all are equal."""
-        frames = self.frames_of_points.to(H)
+        frames = self.frames.to(H)
         return frames[0, 0] if frames.shape[:2] == (1, 1) else frames
 
     def _fibre_response(self, E: Tensor) -> Response:
@@ -215,7 +222,7 @@ class FibreReinforced(Material):
 def fibre_frames(material: Material, count: int) -> Tensor:
     """Return the fibre frames of the law of E cells, (E, Q or 1, 3, 3) [-]; NaN without fibres."""
     laws = [
-        (law.frames_of_points, cells)
+        (law.frames, cells)
         for law, cells in material.groups(count)
         if isinstance(law, FibreReinforced)
     ]
@@ -238,19 +245,3 @@ def _moduli(D: tuple[Tensor, ...]) -> Tensor:
     pairs = [v for row in COMPONENT for v in row]
     entries = [upper[min(v, w), max(v, w)] for v in pairs for w in pairs]
     return torch.stack(entries, -1).unflatten(-1, (9, 9))
-
-
-def _check_frames(frames: Tensor) -> None:
-    """Raise a ValueError unless frames are (E, 3, 3) or (E, Q, 3, 3) and orthonormal."""
-    if frames.dim() not in (3, 4) or frames.shape[-2:] != (3, 3) or not frames.numel():
-        raise ValueError(
-            f"directions of shape {tuple(frames.shape)} must have (cells, 3, 3) or "
-            "(cells, points, 3, 3)"
-        )
-    gap = frames.mT @ frames - torch.eye(3, dtype=frames.dtype, device=frames.device)
-    bad = ~(gap.abs().flatten(1).amax(1) <= ORTHONORMAL)
-    if bad.any():
-        raise ValueError(
-            f"directions must have orthonormal columns; in {int(bad.sum())} of {len(frames)} cells "
-            "they do not"
-        )
