@@ -34,7 +34,13 @@ if TYPE_CHECKING:
     from dpl.fem.materials.fibres.reinforced import FibreDirections, FibreReinforced
     from dpl.fem.materials.heterogeneous import Heterogeneous
     from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-    from dpl.fem.materials.isochoric import DemirayK2, MooneyRivlinK2, YeohK2
+    from dpl.fem.materials.isochoric import (
+        DemirayK2,
+        MooneyRivlinK2,
+        VolumetricK2,
+        VolumetricK4,
+        YeohK2,
+    )
     from dpl.fem.materials.linear_elastic import LinearElastic, SaintVenantKirchhoff
     from dpl.fem.materials.material import Material, Response, YoungPoissonMaterial
     from dpl.fem.materials.neo_hookean import (
@@ -45,7 +51,6 @@ if TYPE_CHECKING:
     )
     from dpl.fem.materials.ogden import OgdenK2
     from dpl.fem.materials.parameters import CellField
-    from dpl.fem.materials.volumetric import VolumetricK2, VolumetricK4
     from dpl.fem.mesh.generators import box, finger, rectangle
     from dpl.fem.mesh.propeller_mesh import propeller
     from dpl.fem.mesh.reading import read_cell_data, read_mesh

@@ -10,11 +10,11 @@ from dpl.fem.materials.invariant_based import Derivatives, InvariantBasedMateria
 from dpl.fem.materials.isochoric import (
     PolynomialMaterial,
     isochoric_invariants,
+    k4_derivatives,
     polynomial_derivatives,
 )
 from dpl.fem.materials.material import YoungPoissonMaterial
 from dpl.fem.materials.tensors import trace, volume_change
-from dpl.fem.materials.volumetric import k4_derivatives
 
 
 @dataclass(frozen=True)
