@@ -108,12 +108,12 @@ BROKEN_MESHES: dict[str, tuple[str, Any, dict[str, Any]]] = {
         {"triangle": np.array([[0, 1, 2], [0, 2, 3], [3, 4, 5], [4, 6, 5], [4, 2, 6]])},
     ),
     "two kinds": (
-        "mixes hexahedron and tetra",
+        "holds hexahedron and tetra",
         np.concatenate([TWO_CUBES, CORNERS + np.array([2, 0, 0])]),
         {"hexahedron": TWO_HEXES, "tetra": TETS + 12},
     ),
-    "lines only": ("no supported cells", TWO_CUBES, {"line": TWO_HEXES[:, :2]}),
-    "wedges": ("no supported cells", TWO_CUBES, {"wedge": np.array([[0, 1, 3, 6, 7, 9]])}),
+    "lines only": ("holds line cells", TWO_CUBES, {"line": TWO_HEXES[:, :2]}),
+    "wedges": ("holds wedge cells", TWO_CUBES, {"wedge": np.array([[0, 1, 3, 6, 7, 9]])}),
     "surface in space": (
         "surface mesh embedded in 3D",
         with_node(PATCH, 4, [0.5, 0.5, 0.3]),

@@ -164,6 +164,11 @@ BROKEN = [  # laws, regions, message
         "regions: 4 cells belong to both core and end",
     ),
     ({"core": NH}, LEFT, "regions: 12 of 24 cells belong to no region; add material.other"),
+    (
+        BOTH,
+        LEFT | {"other": fem.Box([0.9, 0.0, 0.0], [1.0, 1.0, 1.0])},
+        "regions: 8 of 24 cells belong to no region; remove regions.other",
+    ),
     (BOTH, {"core": fem.Box([0, 0, 0], [2, 1, 1])}, "all cells belong to other regions"),
     (BOTH, {"core": fem.Box([5, 0, 0], [6, 1, 1])}, "material.core: Box.* holds no cell"),
     (

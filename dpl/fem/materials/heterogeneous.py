@@ -66,13 +66,13 @@ class Heterogeneous(Material):
                 both = f"{names[index[twice[0]]]} and {name}"
                 raise ValueError(f"regions: {twice.size} cells belong to both {both}")
             index[cells] = k
-        if (free := np.flatnonzero(index < 0)).size and OTHER not in names:
-            raise ValueError(
-                f"regions: {free.size} of {count} cells belong to no region; add material.{OTHER}"
-            )
-        if OTHER in names and OTHER not in self.regions:
-            if not free.size:
-                raise ValueError(f"material.{OTHER}: all cells belong to other regions; remove it")
+        free, takes_rest = np.flatnonzero(index < 0), OTHER in names and OTHER not in self.regions
+        if free.size and not takes_rest:
+            remedy = f"remove regions.{OTHER}" if OTHER in names else f"add material.{OTHER}"
+            raise ValueError(f"regions: {free.size} of {count} cells belong to no region; {remedy}")
+        if takes_rest and not free.size:
+            raise ValueError(f"material.{OTHER}: all cells belong to other regions; remove it")
+        if takes_rest:
             index[free] = names.index(OTHER)
         return super().on(basis, length, origin)._with_layout(torch.from_numpy(index))
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import meshio
 import numpy as np
 import skfem
+from meshio._common import num_nodes_per_cell
+from meshio._mesh import topological_dimension
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from skfem.io.meshio import HEX_MAPPING, from_meshio
@@ -18,17 +20,8 @@ from dpl.fem.mesh.validation import check_coordinates, check_mesh, listed
 from dpl.system.checks import named_errors
 from dpl.system.memory import refuse_mesh
 
-CELLS = {  # supported types of cells in meshio: dimension, nodes
-    "hexahedron": (3, 8),
-    "hexahedron27": (3, 27),
-    "tetra": (3, 4),
-    "tetra10": (3, 10),
-    "quad": (2, 4),
-    "quad9": (2, 9),
-    "triangle": (2, 3),
-    "triangle6": (2, 6),
-}
-SIDES = {"line": 2, "triangle": 3, "quad": 4}  # vertices of a facet, which come first
+# supported types of cells in meshio
+CELLS = ("hexahedron", "hexahedron27", "tetra", "tetra10", "quad", "quad9", "triangle", "triangle6")
 MAX_VALUES = 1000  # distinct values of an integer field that becomes tags
 Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
@@ -101,7 +94,7 @@ def read_cell_data(path: str | Path, names: Sequence[str]) -> list[Array]:
 def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
     """Return the validated mesh of the content of a file, and a clause for each repair."""
     kind = _cell_type(raw)
-    dim, width = CELLS[kind]
+    dim = topological_dimension[kind]
     points = np.asarray(raw.points, dtype=np.float64)
     if points.ndim != 2:
         raise ValueError("lists nodes with too few coordinates; does it end too early?")
@@ -121,7 +114,7 @@ def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
         )
     used, compact = np.unique(cells, return_inverse=True)
     refuse_mesh(len(used), "its size")
-    compact, unused = compact.reshape(-1, width), len(points) - len(used)
+    compact, unused = compact.reshape(cells.shape), nodes - len(used)
     points = points[used]
     check_coordinates(points, used)
     if dim == 2:
@@ -142,17 +135,13 @@ def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
 def _cell_type(raw: meshio.Mesh) -> str:
     """Return the type in meshio of the cells of the highest dimension."""
     blocks = [block for block in raw.cells if len(block.data)]
-    found = {block.type for block in blocks}
-    if not found & set(CELLS):
-        names = ", ".join(sorted(found)) or "none"
-        raise ValueError(f"holds no supported cells ({names}); convert them to {', '.join(CELLS)}")
-    dim = max(block.dim for block in blocks)
+    dim = max((block.dim for block in blocks), default=0)
     kinds = sorted({block.type for block in blocks if block.dim == dim})
-    if len(kinds) > 1 or kinds[0] not in CELLS:
-        what = f"mixes {' and '.join(kinds)} cells" if len(kinds) > 1 else f"holds {kinds[0]} cells"
-        raise ValueError(f"{what}; convert them to one type: {', '.join(CELLS)}")
+    if len(kinds) != 1 or kinds[0] not in CELLS:
+        names = " and ".join(kinds) or "no"
+        raise ValueError(f"holds {names} cells; convert them to one type: {', '.join(CELLS)}")
     for block in raw.cells:
-        width = CELLS[kinds[0]][1] if block.type == kinds[0] else None
+        width = num_nodes_per_cell[kinds[0]] if block.type == kinds[0] else None
         if np.ndim(block.data) != 2 or width not in (None, block.data.shape[1]):
             raise ValueError("lists cells with too few nodes; does it end too early?")
     return kinds[0]
@@ -194,7 +183,8 @@ def _add_tags(mesh: skfem.Mesh, raw: meshio.Mesh, kind: str, corners: Numbers) -
         _check_indices(f"{block.type} cells", block.data, len(vertex))
         indices.append(count + np.arange(len(block.data)) if kept else None)
         count += len(block.data) if kept else 0
-        fits = not kept and SIDES.get(block.type.rstrip("0123456789")) == width
+        # of facets of quadratic cells, the vertices come first
+        fits = not kept and num_nodes_per_cell.get(block.type.rstrip("0123456789")) == width
         known.append(_find_facets(mesh, vertex[block.data[:, :width]]) if fits else None)
     for name, b, members in _cell_sets(raw):
         size = len(raw.cells[b].data) if b < len(indices) else 0

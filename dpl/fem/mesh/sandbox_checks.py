@@ -13,11 +13,12 @@ from xml.parsers import expat
 
 import meshio
 import numpy as np
+from meshio._common import num_nodes_per_cell
+from meshio.gmsh.common import _gmsh_to_meshio_type
 from meshio.vtu._vtu import VtuReader
 
 CONVERT = "which is not read; convert it with 'meshio convert' if you trust it"
-NODES = (2, 3, 4, 4, 8, 6, 5, 3, 6, 9, 10, 27, 18, 14, 1, 8, 20, 15, 13)
-GMSH_NODES = dict(enumerate(NODES, start=1))  # by type of element
+GMSH_NODES = {kind: num_nodes_per_cell[name] for kind, name in _gmsh_to_meshio_type.items()}
 
 PERMAS = ("$COOR", r"^\$*COOR[^\n]*\n([^$!]*)")
 NODE_BLOCKS = {  # name and pattern of the blocks of nodes, by suffix

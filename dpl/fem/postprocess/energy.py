@@ -58,14 +58,13 @@ class RestStiffness:
         terms = StiffnessTerms.of(self.problem)
         return terms, [RestStiffness(body) for body in terms.bodies]
 
-    def linear_strain_energy(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
+    def linear_strain_energy(self, force: Tensor, parameters: Tensor) -> Tensor:
         """Return f.K(0)^-1 f / 2, the strain energy of the linear solution, (B,) [-].
 
         The relative error is about 1e-3, because the value is used as a scale only. Results are
         cached by the hash of the force, since the forces of a data set recur every epoch.
         """
         problem, found = self._linear.problem, []
-        parameters = force.new_zeros(1, 0) if parameters is None else parameters
         for one, own in zip(force.cpu(), parameters.cpu().expand(len(force), -1), strict=True):
             linear = self._linear.with_parameters(own[None])
             right = problem.restrict(one - linear.problem.force_at_rest)
