@@ -80,13 +80,6 @@ class RestStiffness:
     def _works(self) -> dict[int, float]:
         return {}
 
-    def energy(self, parameters: Tensor) -> Tensor:
-        """Return the strain energy at rest W(0), (1,) or (B,) [-]; it is not zero for every law."""
-        body = self.problem.with_parameters(parameters)
-        nothing = body.points.new_zeros(1, len(body.cells), 1, 3, 3)
-        volumes = body.dV.sum(1).expand(len(body.cells))
-        return (body.material.energy(nothing)[..., 0] * volumes).sum(1).expand(len(parameters))
-
     @cached_property
     def _linear(self) -> LinearSolver:
         on_cpu = self.problem.points.device.type == "cpu"
@@ -107,7 +100,7 @@ class RestStiffness:
 
 
 def potential_energy(
-    displacement: Tensor, load: Load, problem: Problem, rest: RestStiffness
+    displacement: Tensor, load: Load, problem: Problem
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return W(u) - W(0) - f.u (B,), its gradient (B, N, D), and a mask of det F > 0 (B,).
 
@@ -119,14 +112,15 @@ def potential_energy(
             "another loss than energy"
         )
     force, own = load.force, load.parameters.expand(len(displacement), -1)
-    internal, volume = problem.with_parameters(own).evaluate(displacement)
+    body = problem.with_parameters(own)
+    internal, volume = body.evaluate(displacement)
     slope = torch.where(problem.free, internal - force, 0.0)
     count = max(1, ENTRIES // displacement[0].numel())
     parts = zip(displacement.split(count), own.split(count), strict=True)
-    strain = torch.cat(
-        [problem.with_parameters(nu).energy(part) for part, nu in parts]
-    ) - rest.energy(own)
-    energy = strain - (force * displacement).sum(dim=(1, 2))
+    strain = torch.cat([problem.with_parameters(nu).energy(part) for part, nu in parts])
+    nothing = body.points.new_zeros(1, len(body.cells), 1, 3, 3)
+    at_rest = (body.material.energy(nothing)[..., 0] * body.dV.sum(1)).sum(1)  # not always zero
+    energy = strain - at_rest - (force * displacement).sum(dim=(1, 2))
     sound = (volume > 0) & energy.isfinite() & slope.flatten(1).isfinite().all(dim=1)
     return energy, slope, sound
 

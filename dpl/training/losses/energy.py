@@ -69,7 +69,7 @@ class PotentialEnergyLoss(Loss):
         with torch.no_grad():
             work = rest.linear_strain_energy(batch.force, batch.parameters)
             scale = clamp_scale(work, self.floor)
-            energy, slope, sound = potential_energy(prediction, batch.load, physics.problem, rest)
+            energy, slope, sound = potential_energy(prediction, batch.load, physics.problem)
             if not sound.all():
                 image = rest.product(prediction, batch.parameters)
                 energy = torch.where(sound, energy, (prediction * image).sum(dim=(1, 2)) / 2)
