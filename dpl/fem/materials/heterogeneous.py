@@ -221,15 +221,16 @@ def merge_laws(
     laws: Sequence[Material], numbers: Sequence[int], law_of_cell: Tensor, cells: Tensor
 ) -> Material:
     """Return laws of one class as one law of their cells (C,), whose constants are fields."""
+    laws = [law.of_cells(cells) for law in laws]
     if len(laws) == 1:
-        return laws[0].of_cells(cells)
+        return laws[0]
     ranges = {name: ends for law in laws for name, ends in law.parameter_ranges.items()}
     constants: dict[str, Any] = dict(ranges)  # such a law has no moduli yet
-    index = torch.searchsorted(torch.tensor(numbers), law_of_cell.clamp(max=numbers[-1]))
+    index = torch.searchsorted(torch.tensor(numbers), law_of_cell[cells])
     for name in set(laws[0].ranged) - set(ranges):
         if getattr(laws[0], name) is None:
             continue
         own = [law.given(name) for law in laws]
         if not all(value.ndim == 0 and value == own[0] for value in own):
-            constants[name] = values_of_cells(own, index)[..., cells, :]
+            constants[name] = values_of_cells(own, index)
     return replace(cast("Any", laws[0]), **constants)
