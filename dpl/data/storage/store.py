@@ -32,7 +32,6 @@ from dpl.data.storage.shard import (
     Columns,
     encode_load,
     encode_shard,
-    read_description,
     read_shard,
     reasons,
     single_loads,
@@ -132,7 +131,7 @@ class Store:
     def describe(self, path: Path) -> Shard:
         """Return a shard without its solutions; raise ValueError if it is damaged."""
         self._check_file(path)
-        name, columns = SHARD_NAME.fullmatch(path.name), read_description(path)
+        name, columns = SHARD_NAME.fullmatch(path.name), read_shard(path)
         if name is None or int(name[2]) != columns["tried"][0]:
             raise ValueError("has another name than that of its first load")
         return Shard(path, name[1], columns)
