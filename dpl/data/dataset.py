@@ -20,9 +20,8 @@ from rich import progress
 from dpl.data.solving.background import Background
 from dpl.data.solving.solve import Guess, LoadKey, SolvedLoad
 from dpl.data.solving.worker_pool import graceful_shutdown, solve_loads
-from dpl.data.storage.acceptance import bias_warning
 from dpl.data.storage.integrity import repair, verify
-from dpl.data.storage.store import FORMAT, JOURNAL, STREAMS, Store, blocks
+from dpl.data.storage.store import FORMAT, JOURNAL, STREAMS, Store, bias_warning, blocks
 from dpl.scene import Scene
 from dpl.system.checks import check_range
 from dpl.system.files import append_jsonl, exclusive_lock, write_file
