@@ -65,8 +65,8 @@ def graceful_shutdown() -> Iterator[list[int]]:
                 previous[number] = signal.signal(number, handle)
         yield received
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for each, handler in previous.items():
+            signal.signal(each, handler)
     if received:
         leave()
 

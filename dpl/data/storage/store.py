@@ -312,13 +312,13 @@ class Store:
         """
         keys = "loads", "seconds", "core_seconds"
         lines = read_jsonl(self.folder / JOURNAL)
-        rows = [[line.get(key) for key in keys] for line in lines]
+        rows: list[list[Any]] = [[line.get(key) for key in keys] for line in lines]
         valid = [
             row
             for row in rows
             if all(type(one) in (int, float) and 0 <= one < MAX_DURATION for one in row)
         ]
-        loads, wall, core = np.reshape(valid, (-1, len(keys))).astype(float).sum(axis=0).tolist()
+        loads, wall, core = (sum(row[k] for row in valid) for k in range(len(keys)))
         return len(valid), loads, wall, core
 
 
