@@ -94,11 +94,7 @@ def read_shard(
 ) -> Columns:
     """Return the columns of a shard; without `shape` those of `DESCRIPTION`, digest unchecked.
 
-    Args:
-        path: The file.
-        shape: (N, D).
-        dimension: d, number of coordinates of the point that a load is drawn from.
-        n_parameters: P, number of parameters of a load.
+    `shape` is (N, D). A load is drawn from a point with `dimension` coordinates.
 
     Raises:
         FileNotFoundError: The file does not exist.

@@ -52,8 +52,7 @@ def project(
 ) -> tuple[Tensor, Tensor]:
     """Return the largest amplitudes and the relative residuals of forces (B, N, D), (B,) each.
 
-    `fit` has shapes (N, D, K) and the range of the coefficients, span; `amplitude` maps the
-    coefficients (K,) to amplitudes, (K,) or (1,).
+    `amplitude` maps coefficients (K,), of the range `span`, to amplitudes, (K,) or (1,).
     """
     fits = [fit(shapes, force, *span) for force in forces.numpy()]
     largest = [amplitude(coefficients).max() for coefficients, _ in fits]
