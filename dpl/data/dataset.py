@@ -19,10 +19,9 @@ from rich import progress
 
 from dpl.data.solving.background import Background
 from dpl.data.solving.solve import Guess, LoadKey, SolvedLoad
-from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
-from dpl.data.storage.acceptance import bias_warning
+from dpl.data.solving.worker_pool import graceful_shutdown, solve_loads
 from dpl.data.storage.integrity import repair, verify
-from dpl.data.storage.store import FORMAT, JOURNAL, STREAMS, Store, blocks
+from dpl.data.storage.store import FORMAT, JOURNAL, STREAMS, Store, bias_warning, blocks
 from dpl.scene import Scene
 from dpl.system.checks import check_range
 from dpl.system.files import append_jsonl, exclusive_lock, write_file
@@ -126,11 +125,11 @@ class DataSet:
         """Solve these loads, by split, under a progress bar."""
         total = sum(map(len, missing.values()))
         if total or self.store.scattered(self.shard, self.shards):
-            with GracefulShutdown() as stop:
-                # closed first, which ends the workers
-                with closing(LoadSolver(self, missing.items(), stop=stop)) as solver:
-                    solver.finish(total)
-                stop.exit()
+            with (
+                graceful_shutdown() as stop,
+                closing(LoadSolver(self, missing.items(), stop=stop)) as solver,
+            ):
+                solver.finish(total)
 
     def create(self) -> None:
         """Write `scene.json` if it is missing; raise DataSetError if the folder is no data set."""

@@ -3,8 +3,9 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
+import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
@@ -16,24 +17,11 @@ from dpl.data.sources import Stored
 from dpl.fem import Problem
 from dpl.fem.mesh.nodal_fields import read_nodal_fields
 from dpl.scene import Sample, Scene
+from dpl.system.checks import named_errors
 
 FEW = 16  # pairs to which constants of the law are fitted
 POISSON = (0.0, 0.4999)  # range of Poisson's ratio in this fit [-]
 BATCH = 8  # pairs whose residuals are computed together
-
-
-class LawFit(NamedTuple):
-    """Constants of a law with the smallest residuals.
-
-    Attributes:
-        young: Young's modulus over that of the scene [-].
-        poisson: Poisson's ratio [-]; None for a law without this constant.
-        residual: Root mean square of the relative residuals [-].
-    """
-
-    young: float
-    poisson: float | None
-    residual: float
 
 
 class _Read(Stored):
@@ -97,7 +85,8 @@ class PairData(DataModule):
         batches = zip(u.split(BATCH), load.force.split(BATCH), strict=True)
         self.residuals = torch.cat([scene.problem.relative_residual(*pair) for pair in batches])
         wrong = torch.where(scene.problem.free, 0.0, u - scene.problem.prescribed)
-        self.support_errors = _largest(wrong) / _largest(u).clamp(min=1e-300)
+        error, moved = (field.flatten(1).abs().amax(dim=1) for field in (wrong, u))
+        self.support_errors = error / moved.clamp(min=1e-300)
         self._usable = ((self.residuals <= tol) & (self.support_errors <= tol)).nonzero()[:, 0]
         if (train := len(self._usable) - val - test) < 1:
             raise ValueError(self._refusal(scene.problem, float(load.young[0]), val + test))
@@ -109,15 +98,15 @@ class PairData(DataModule):
     def _refusal(self, body: Problem, young: float, needed: int) -> str:
         """Return why too few pairs can be used, and the constants that fit best."""
         few = self.pairs.load.force[:FEW], self.pairs.displacement[:FEW]
-        fit = fit_law(body, *few)
-        best = f"young = {fit.young * young:.4g}"
-        best += "" if fit.poisson is None else f" and poisson = {fit.poisson:.4g}"
+        ratio, poisson, residual = fit_law(body, *few)
+        best = f"young = {ratio * young:.4g}"
+        best += "" if poisson is None else f" and poisson = {poisson:.4g}"
         moved = int((self.support_errors > self._tol).sum())
         return (
             f"path = {self._path}: {len(self._usable)} of {len(self.residuals)} pairs are "
             f"equilibria of this law, more than {needed} are needed; the median residual is "
             f"{float(self.residuals.median()):.2g} and tol = {self._tol:g}, supports move in "
-            f"{moved} pairs; {best} fit the first pairs best, to a residual of {fit.residual:.2g}"
+            f"{moved} pairs; {best} fit the first pairs best, to a residual of {residual:.2g}"
         )
 
     def describe(self) -> list[tuple[str, str]]:
@@ -153,52 +142,48 @@ def read_pairs(
     body, young = scene.problem, scene.loads.moduli
     if young[0] != young[1] or scene.loads.parameter_ranges:
         raise ValueError("pairs belong to one body; young and constants of the law must be numbers")
-    try:
+    with named_errors(f"path = {path}: "):
         force, displacement = read_nodal_fields(path, names, body.points_in_metres, units[1])
         if len(force) != len(displacement):
             counts = f"{len(force)} forces and {len(displacement)} displacements"
             raise ValueError(f"there are {counts}; they must be pairs")
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise ValueError(f"path = {path}: {' '.join(str(reason).split())}") from error
+        if not (np.isfinite(force).all() and np.isfinite(displacement).all()):
+            raise ValueError("all forces and displacements must be finite")
     modulus = torch.full((len(force),), float(young[0]), dtype=torch.float64)
     load = scene.load_of(units[0] * torch.from_numpy(force), modulus)
-    u = torch.from_numpy(displacement) * (units[1] / body.length)
-    if not (load.force.isfinite().all() and u.isfinite().all()):
-        raise ValueError(f"path = {path}: all forces and displacements must be finite")
-    return Sample(load.force, u, modulus)
+    return Sample(load.force, torch.from_numpy(displacement) * (units[1] / body.length), modulus)
 
 
-def fit_law(body: Problem, force: Tensor, displacement: Tensor) -> LawFit:
+def fit_law(
+    body: Problem, force: Tensor, displacement: Tensor
+) -> tuple[float, float | None, float]:
     """Return the constants of a law with the smallest residuals of forces (S, N, D) and solutions.
 
     Young's modulus is a linear least-squares fit. If the law has a number `poisson`, it is found by
     bounded minimisation (Brent 1973).
+
+    Returns:
+        Young's modulus over that of the body [-], Poisson's ratio [-] or None for a law without it,
+        and the root mean square of the relative residuals [-].
     """
-    if not isinstance(getattr(body.material, "poisson", None), float):
-        return _fit_modulus(body, force, displacement)
-
-    def fit(poisson: float) -> LawFit:
-        law = replace(cast(Any, body.material), poisson=poisson)
-        return _fit_modulus(replace(body, material=law), force, displacement, poisson)
-
-    found = minimize_scalar(lambda x: fit(float(x)).residual, bounds=POISSON, method="bounded")
-    return fit(float(found.x))
-
-
-def _fit_modulus(
-    body: Problem, force: Tensor, displacement: Tensor, poisson: float | None = None
-) -> LawFit:
-    """Return the best Young's modulus of a law whose other constants are given."""
     given = body.acting(force).flatten(1)
     size = given.norm(dim=1, keepdim=True)
-    computed = body.acting(body.internal_force(displacement)).flatten(1) / size
     given = given / size
-    young = (given * computed).sum() / computed.square().sum()
-    residual = (given - young * computed).square().sum(dim=1).mean().sqrt()
-    return LawFit(float(young), poisson, float(residual))
 
+    def fit(body: Problem) -> tuple[float, float]:
+        computed = body.acting(body.internal_force(displacement)).flatten(1) / size
+        young = (given * computed).sum() / computed.square().sum()
+        residual = (given - young * computed).square().sum(dim=1).mean().sqrt()
+        return float(young), float(residual)
 
-def _largest(field: Tensor) -> Tensor:
-    """Return the largest component of each field (B, N, D), (B,)."""
-    return field.flatten(1).abs().amax(dim=1)
+    def with_poisson(poisson: float) -> Problem:
+        return replace(body, material=replace(cast(Any, body.material), poisson=poisson))
+
+    if not isinstance(getattr(body.material, "poisson", None), float):
+        young, residual = fit(body)
+        return young, None, residual
+    poisson = minimize_scalar(
+        lambda x: fit(with_poisson(float(x)))[1], bounds=POISSON, method="bounded"
+    ).x
+    young, residual = fit(with_poisson(float(poisson)))
+    return young, float(poisson), residual

@@ -3,11 +3,12 @@
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from dpl.data.dataset import MAX_LOADS, DataSet, LoadSolver
-from dpl.data.learning_curve import CurvePoint, describe, in_words, loads_for
 from dpl.data.solving.solve import Guess
 from dpl.data.storage.store import SHARD_SIZE, Store
 from dpl.scene import Sample, Scene
@@ -22,6 +23,25 @@ MIN_GAIN = 0.95  # ratio of errors from which a fit is one without gain
 # ratio of the training loads of a fit to those of the one before
 MIN_FACTOR = math.sqrt(2)
 MAX_FACTOR = 4
+FITTED = 4  # last points of a learning curve that the power law is fitted to
+MIN_EXPONENT = 0.05  # slower decay predicts nothing
+
+
+class CurvePoint(NamedTuple):
+    """Held-out errors of a fit.
+
+    Attributes:
+        loads: Number of training loads.
+        seconds: Wall time since the start of the training [s].
+        median, worst: Median and maximum over held-out loads of the relative L2 error [-].
+        e_mean: See `dpl.training.metrics.METRICS` [-].
+    """
+
+    loads: int
+    seconds: float
+    median: float
+    worst: float
+    e_mean: float
 
 
 class Source:
@@ -104,6 +124,7 @@ class Stored(Source):
         yield dataset.sizes
 
 
+@dataclass(eq=False)
 class Growing(Source):
     """Training loads that are solved in the background while a model is fitted to the first ones.
 
@@ -114,25 +135,25 @@ class Growing(Source):
     smaller ones.
 
     The loads are those of the data set of the same seed, in the same order.
+
+    Attributes:
+        error: Median over held-out loads of the relative L2 error at which the growth ends [-].
+        minutes: Time after which the growth ends [min]; None: no limit.
+        max_train: Largest number of training loads.
     """
 
-    def __init__(
-        self, *, error: float = 1e-3, minutes: float | None = None, max_train: int = 10_000
-    ) -> None:
-        """Check the arguments.
+    _: KW_ONLY
+    error: float = 1e-3
+    minutes: float | None = None
+    max_train: int = 10_000
 
-        Args:
-            error: Median over held-out loads of the relative L2 error at which the growth ends [-].
-            minutes: Time after which the growth ends [min]; None: no limit.
-            max_train: Largest number of training loads.
-        """
-        if not 0 < error < math.inf:
-            raise ValueError(f"error = {error} must be above 0")
-        if minutes is not None and not minutes > 0:
-            raise ValueError(f"minutes = {minutes} must be above 0 [min], or null")
-        check_range(1, MAX_LOADS, max_train=max_train)
+    def __post_init__(self) -> None:
+        if not 0 < self.error < math.inf:
+            raise ValueError(f"error = {self.error} must be above 0")
+        if self.minutes is not None and not self.minutes > 0:
+            raise ValueError(f"minutes = {self.minutes} must be above 0 [min], or null")
+        check_range(1, MAX_LOADS, max_train=self.max_train)
         self.points: list[CurvePoint] = []
-        self._error, self._minutes, self._max_train = error, minutes, max_train
         self._start = self._fit_start = time.monotonic()
         self._fit_seconds = 0.0  # duration of the last fit
 
@@ -168,10 +189,10 @@ class Growing(Source):
     def _loads(self, dataset: DataSet) -> Iterator[tuple[str, range]]:
         """Yield splits and loads in the order of the solves; the rest once the growth has ended."""
         val = 0
-        for train in range(0, self._max_train, SHARD_SIZE):
+        for train in range(0, self.max_train, SHARD_SIZE):
             if self.is_finished:
                 break
-            end = min(train + SHARD_SIZE, self._max_train)
+            end = min(train + SHARD_SIZE, self.max_train)
             held_out = fit_sizes(end, dataset.val)["val"]
             yield "val", range(val, held_out)
             yield "train", range(train, end)
@@ -182,20 +203,20 @@ class Growing(Source):
     def _limits(self) -> tuple[int, int]:
         """Return the smallest and the largest number of training loads of the next fit."""
         if not self.points:
-            first = min(SHARD_SIZE, self._max_train)
+            first = min(SHARD_SIZE, self.max_train)
             return first, first
         last = self.points[-1].loads
-        needed = loads_for(self.points, self._error) or MAX_LOADS
+        needed = loads_for(self.points, self.error) or MAX_LOADS
         limits = MIN_FACTOR * last, min(MAX_FACTOR * last, needed)
         shards = (math.ceil(loads / SHARD_SIZE) for loads in limits)
-        least, most = (min(self._max_train, count * SHARD_SIZE) for count in shards)
+        least, most = (min(self.max_train, count * SHARD_SIZE) for count in shards)
         return least, max(least, most)
 
     def _deadline(self) -> float | None:
         """Return the time at which a fit has to start to end in time [s]; None: no limit."""
-        if self._minutes is None or not self.points:
+        if self.minutes is None or not self.points:
             return None
-        return self._start + 60 * self._minutes - self._fit_seconds
+        return self._start + 60 * self.minutes - self._fit_seconds
 
     def unseen(self, store: Store, loads: int) -> Sample | None:
         """Return the training samples that follow those of a fit, None after the last ones."""
@@ -209,30 +230,30 @@ class Growing(Source):
         now = time.monotonic()
         self._fit_seconds = now - self._fit_start
         self.points.append(CurvePoint(loads, now - self._start, **errors))
-        line = describe(self.points, self._error)
+        line = describe(self.points, self.error)
         reason = self._limit_reached
         return f"{line}; {reason}" if reason else line
 
     @property
     def is_finished(self) -> bool:
         """True if the last fit meets the error wanted or a limit is reached."""
-        met = self.points and self.points[-1].median <= self._error
+        met = self.points and self.points[-1].median <= self.error
         return bool(met or self._limit_reached)
 
     @property
     def _limit_reached(self) -> str:
         """Limit that the last fit has reached, in words; empty if there is none."""
-        if not self.points or (last := self.points[-1]).median <= self._error:
+        if not self.points or (last := self.points[-1]).median <= self.error:
             return ""
-        if last.loads >= self._max_train:
-            return f"data.train.max_train = {self._max_train} reached"
+        if last.loads >= self.max_train:
+            return f"data.train.max_train = {self.max_train} reached"
         medians = [point.median for point in self.points]
         before, recent = medians[:-PATIENCE], medians[-PATIENCE:]
         if before and min(recent) > MIN_GAIN * min(before):
             return f"{PATIENCE} fits without gain: more loads no longer reduce the error"
         # the next fit would take at least as long as the last one
-        if self._minutes is not None and last.seconds + self._fit_seconds >= 60 * self._minutes:
-            return f"data.train.minutes = {self._minutes:g} reached"
+        if self.minutes is not None and last.seconds + self._fit_seconds >= 60 * self.minutes:
+            return f"data.train.minutes = {self.minutes:g} reached"
         return ""
 
     def state_dict(self) -> dict[str, Any]:
@@ -247,3 +268,43 @@ class Growing(Source):
 def fit_sizes(train: int, val: int) -> dict[str, int]:
     """Return the numbers of held-out loads, of `val`, and of training loads of a fit, by split."""
     return {"val": min(val, max(HELD_OUT, train // 2)), "train": train}
+
+
+def loads_for(points: Sequence[CurvePoint], error: float) -> int | None:
+    """Return the number of loads at which a median error is expected; None above `MAX_LOADS`.
+
+    A power law, error = a loads^-b, is fitted to the last points by least squares of logarithms.
+    """
+    last = [point for point in points[-FITTED:] if point.median > 0]
+    if len(last) < 2 or not all(math.isfinite(point.median) for point in last):
+        return None
+    loads = np.log([point.loads for point in last])
+    if np.ptp(loads) == 0:
+        return None
+    slope, offset = np.polyfit(loads, np.log([point.median for point in last]), 1)
+    if slope > -MIN_EXPONENT:
+        return None
+    exponent = (math.log(error) - offset) / slope
+    return math.ceil(math.exp(exponent)) if exponent < math.log(MAX_LOADS) else None
+
+
+def describe(points: Sequence[CurvePoint], error: float) -> str:
+    """Return the last point in words, and the number of loads that an error is expected to need."""
+    last = points[-1]
+    line = f"{last.loads} loads, {last.seconds:.0f} s: {in_words(last._asdict())}"
+    if last.median <= error:
+        return f"{line}; target of {_percent(error)} reached"
+    if (needed := loads_for(points, error)) is None:
+        return line
+    needed = round(float(f"{max(needed, last.loads + 1):.2g}"))
+    return f"{line}; about {needed} loads for {_percent(error)}"
+
+
+def in_words(errors: Mapping[str, float]) -> str:
+    """Return the `median`, `worst` and `e_mean` of a fit in words."""
+    median, worst = _percent(errors["median"]), _percent(errors["worst"])
+    return f"median {median}, worst {worst}, e_mean {errors['e_mean']:.1e}"
+
+
+def _percent(ratio: float) -> str:
+    return f"{100 * ratio:.2g} %"

@@ -1,8 +1,10 @@
 """Endless stream of training samples that worker processes solve while a network trains."""
 
 import itertools
+import sys
 import time
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
@@ -39,7 +41,10 @@ class Stream(Source):
     new_per_round: int = 8
     reuse: int = 50
     capacity: int = 4096
+    _samples: Generator[tuple[int, Sample], None, None] | None = field(default=None, init=False)
     _replay: "ReplayBuffer | None" = field(default=None, init=False)
+    _processes: int = field(default=1, init=False)
+    _workers: int = field(default=0, init=False)
     _first: int = field(default=0, init=False)  # number of loads of the run that this one resumes
 
     def __post_init__(self) -> None:
@@ -70,21 +75,24 @@ class Stream(Source):
         """Return the stream; training is limited to the cores that its workers leave."""
         leave_cores(data.workers)
         self.close()  # the stream of an earlier training
-        stream = SampleStream(
+        rank, self._processes = data.rank_and_world_size
+        self._workers = data.workers
+        self._samples = accepted_samples(
             data.scene,
             data.store.stream("train"),
-            self._first,
-            *data.rank_and_world_size,
-            workers=data.workers,
+            self._first + rank,
+            self._processes,
+            workers=self._workers,
             timeout=data.dataset.timeout,
         )
-        self._replay = ReplayBuffer(stream, self, data.batch_size, data.shuffle_seed, data.group)
+        sizes = data.batch_size, data.shuffle_seed, data.group
+        self._replay = ReplayBuffer(self._samples, self, *sizes)
         return self._replay
 
     def close(self) -> None:
         """Stop the workers."""
-        if self._replay is not None:
-            self._replay.stream.close()
+        if self._samples is not None:
+            self._samples.close()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of loads that all training processes have taken.
@@ -95,10 +103,9 @@ class Stream(Source):
         taken = self._first
         if self._replay is not None:
             taken = max(taken, self._replay.next_index)
-            processes, workers = self._replay.stream.world_size, self._replay.stream.workers
-            if processes > 1:
-                beyond = taken - self._first - processes * self._replay.produced
-                taken += processes * max(1, workers) + max(0, beyond)
+            if self._processes > 1:
+                beyond = taken - self._first - self._processes * self._replay.produced
+                taken += self._processes * max(1, self._workers) + max(0, beyond)
         return {"next_index": taken}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -106,38 +113,32 @@ class Stream(Source):
         self._first = state["next_index"]
 
 
-@dataclass(eq=False)
-class SampleStream:
-    """The accepted loads of an endless stream, in the order of their numbers.
+def accepted_samples(
+    scene: Scene,
+    seed: tuple[int, int],
+    first: int = 0,
+    step: int = 1,
+    *,
+    workers: int = 0,
+    timeout: float | None = None,
+) -> Generator[tuple[int, Sample], None, None]:
+    """Yield numbers and samples (N, D) of the accepted loads of an endless stream in their order.
 
-    Worker processes solve loads ahead of their use. Without workers a load is solved when it is
-    needed. Nothing is solved before the first sample is needed.
-
-    Attributes:
-        scene, workers, timeout: See `solve_loads`.
-        seed: Seed of the stream.
-        first: Number of the first load.
-        rank: Index of this training process, of `world_size` processes that share the stream.
+    Its loads have the numbers `first`, `first + step` and so on. Worker processes, see
+    `solve_loads`, solve loads ahead of their use, and end when the generator is closed. Without
+    workers a load is solved when it is needed. Nothing is solved before the first sample is needed.
     """
+    numbers = range(first, sys.maxsize, step)
 
-    scene: Scene
-    seed: tuple[int, int]
-    first: int = 0
-    rank: int = 0
-    world_size: int = 1
-    _: KW_ONLY
-    workers: int = 0
-    timeout: float | None = None
-    _solved: Background[SolvedLoad] | None = field(default=None, init=False)
+    def solve(stop: StopFlag) -> Generator[SolvedLoad, None, None]:
+        jobs = (LoadKey(seed, number) for number in numbers)
+        return solve_loads(scene, jobs, workers=workers, timeout=timeout, stop=stop)
 
-    def __iter__(self) -> Iterator[tuple[int, Sample]]:
-        """Yield numbers and samples, fields of shape (N, D)."""
-        ahead, loads = AHEAD * self.workers, self.scene.loads
-        self._solved = Background(self._solve, thread=self.workers > 0, ahead=ahead)
-        early: dict[int, SolvedLoad] = {}
-        for number in self._numbers():
+    early: dict[int, SolvedLoad] = {}
+    with closing(Background(solve, thread=workers > 0, ahead=AHEAD * workers)) as background:
+        for number in numbers:
             while number not in early and len(early) < MAX_EARLY:
-                if (solved := self._solved.get()) is None:  # the stream has been closed
+                if (solved := background.get()) is None:  # it has been stopped
                     return
                 if solved.job.number >= number:
                     early[solved.job.number] = solved
@@ -145,20 +146,9 @@ class SampleStream:
             if found is not None and found.accepted:
                 point = torch.from_numpy(found.point)[None]
                 force, displacement = map(torch.from_numpy, (found.force, found.displacement))
-                young, parameters = loads.young_at(point)[0], loads.parameters_at(point)[0]
+                young = scene.loads.young_at(point)[0]
+                parameters = scene.loads.parameters_at(point)[0]
                 yield number, Sample(force, displacement, young, parameters)
-
-    def _numbers(self) -> Iterator[int]:
-        return itertools.count(self.first + self.rank, self.world_size)
-
-    def _solve(self, stop: StopFlag) -> Generator[SolvedLoad, None, None]:
-        jobs = (LoadKey(self.seed, number) for number in self._numbers())
-        return solve_loads(self.scene, jobs, workers=self.workers, timeout=self.timeout, stop=stop)
-
-    def close(self) -> None:
-        """Finish the solves in progress and end the workers."""
-        if self._solved is not None:
-            self._solved.close()
 
 
 class ReplayBuffer:
@@ -171,7 +161,6 @@ class ReplayBuffer:
     is an epoch; the stream continues from epoch to epoch.
 
     Attributes:
-        stream: Source of the samples.
         produced: Number of samples taken from the stream so far.
         next_index: Upper bound of the numbers of these loads, plus one.
         rates: `produced` samples per second of the last epoch, fraction of its time `waiting` for
@@ -181,28 +170,25 @@ class ReplayBuffer:
 
     def __init__(
         self,
-        stream: SampleStream,
+        samples: Iterable[tuple[int, Sample]],
         sizes: Stream,
         batch_size: int,
         seed: int = 0,
         group: SymmetryGroup = NO_SYMMETRIES,
     ) -> None:
-        """Start with an empty buffer.
+        """Start with an empty buffer, to be filled with samples of loads of ascending numbers.
 
-        Args:
-            stream: Source of the samples.
-            sizes: Sizes of the buffer, of its rounds and of an epoch.
-            batch_size: Samples in a batch.
-            seed: Seed of the choice of samples and images.
-            group: Symmetries of the body, identity first: each use is that of a random image.
+        `sizes` are those of the buffer, of its rounds and of an epoch. The seed decides about the
+        choice of samples and of images: with symmetries of the body, each use is that of a random
+        image.
         """
-        self.stream, self.batch_size, self.group = stream, batch_size, group
+        self.batch_size, self.group = batch_size, group
         self.produced = self.next_index = 0
         self.rates: dict[str, float] | None = None
         self._sizes = sizes
         self._samples: list[Sample] = []
         self._uses_left = torch.zeros(sizes.capacity, dtype=torch.int64)
-        self._batches = self._draw()
+        self._batches = self._draw(iter(samples))
         self._generator = torch.Generator().manual_seed(seed)
         self._used = 0
         self._waited = 0.0
@@ -225,9 +211,9 @@ class ReplayBuffer:
                 }
             yield batch
 
-    def _draw(self) -> Iterator[Sample]:
+    def _draw(self, samples: Iterator[tuple[int, Sample]]) -> Iterator[Sample]:
         """Yield batches without end."""
-        samples, sizes = iter(self.stream), self._sizes
+        sizes = self._sizes
         budget = 0.0  # uses that the samples so far allow
         while True:
             start = time.monotonic()
@@ -246,18 +232,15 @@ class ReplayBuffer:
             while budget >= self.batch_size and self._uses_left.sum() >= self.batch_size:
                 budget -= self.batch_size
                 self._used += self.batch_size
-                batch = stack([self._samples[place] for place in self._choose()])
+                usable = self._uses_left.nonzero()[:, 0]
+                if len(usable) < self.batch_size:  # some more than once
+                    usable = torch.repeat_interleave(usable, self._uses_left[usable])
+                order = torch.randperm(len(usable), generator=self._generator)
+                chosen = usable[order[: self.batch_size]]
+                self._uses_left -= torch.bincount(chosen, minlength=len(self._uses_left))
+                batch = stack([self._samples[place] for place in chosen.tolist()])
                 if self.group:
                     shape = (self.batch_size,)
                     which = torch.randint(len(self.group), shape, generator=self._generator)
                     batch = transform(batch, self.group, which)
                 yield batch
-
-    def _choose(self) -> list[int]:
-        """Return the places of samples for a batch, distinct if there are enough."""
-        usable = self._uses_left.nonzero()[:, 0]
-        if len(usable) < self.batch_size:
-            usable = torch.repeat_interleave(usable, self._uses_left[usable])
-        chosen = usable[torch.randperm(len(usable), generator=self._generator)[: self.batch_size]]
-        self._uses_left -= torch.bincount(chosen, minlength=len(self._uses_left))
-        return list(chosen.tolist())

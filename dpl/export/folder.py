@@ -23,7 +23,7 @@ from torch import Tensor
 
 from dpl.export.comparison import CHECK_STREAM
 from dpl.export.onnx_graph import Array
-from dpl.fem import HasModes, Problem, evaluate_solution, solve, surface
+from dpl.fem import ModalLoads, Problem, evaluate_solution, solve, surface
 from dpl.fem.mesh.writing import with_nodes
 from dpl.fem.postprocess import triangles
 from dpl.scene import Scene
@@ -57,7 +57,7 @@ def write_folder(
     fields, reference = _solve_reference(surrogate)
     for name, field in fields.items():
         _write_raw(folder / "reference" / f"{name}.f64", field)
-    if isinstance(loads, HasModes):
+    if isinstance(loads, ModalLoads):
         _write_raw(folder / "modes.f64", loads.modal_forces.numpy())
     weights = {"state_dict": surrogate.state_dict(), **checkpoints.entries_of_scene(scene)}
     checkpoints.write(weights, folder / "weights.safetensors")
@@ -157,7 +157,7 @@ def _range(scene: Scene) -> dict[str, Any]:
         "largest_force": loads.largest_force,
         "meaning": RANGE,
     }
-    if isinstance(loads, HasModes):
+    if isinstance(loads, ModalLoads):
         found["modes"] = {"file": "modes.f64", "shape": list(loads.modal_forces.shape)}
     return found
 

@@ -11,12 +11,11 @@ if TYPE_CHECKING:
     from dpl.fem.linear.backends import installed_backends
     from dpl.fem.linear.interface import SingularMatrix
     from dpl.fem.loads.distributed import CableLoads, FacePressure, FaceTractions, GravityLoads
-    from dpl.fem.loads.family import HasModes, LoadFamily, RandomLoads
+    from dpl.fem.loads.family import LoadFamily, RandomLoads
     from dpl.fem.loads.file import FileLoads
     from dpl.fem.loads.forces import BodyForce, Traction
     from dpl.fem.loads.mixture import MixtureLoads
-    from dpl.fem.loads.modal import ModalLoads
-    from dpl.fem.loads.modal_basis import Modes, eigenmodes
+    from dpl.fem.loads.modal import ModalLoads, Modes, eigenmodes
     from dpl.fem.loads.patch import PatchLoads
     from dpl.fem.loads.point import PointLoads
     from dpl.fem.materials.fibres.directions import (

@@ -15,8 +15,9 @@ def check_range(low: float, high: float = math.inf, /, **values: float) -> None:
 
 @contextmanager
 def named_errors(place: str) -> Iterator[None]:
-    """Turn errors of values and of files into a ValueError whose message begins with a place."""
+    """Turn errors of values and of files into a ValueError of one line that begins with a place."""
     try:
         yield
     except (ValueError, OSError) as error:
-        raise ValueError(f"{place}{error}") from error
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise ValueError(f"{place}{' '.join(str(reason).split())}") from error

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from viser import ViserServer
 
-from dpl.fem import HasModes
+from dpl.fem import ModalLoads
 from dpl.inference.answer import LEAST_PERCENTAGE, UNKNOWN, UNRELIABLE, relative
 from dpl.viewer.frames import QUANTITIES, Body, Frame, ViewSettings
 from dpl.viewer.recording import RADIUS, SUFFIXES
@@ -100,7 +100,7 @@ class Controls:
 
     def _add_load_controls(self) -> None:
         gui, body, loads = self._gui, self._body, self._body.scene.loads
-        span = loads.patch_radius if isinstance(loads, HasModes) else (0.0, 1.0)
+        span = loads.patch_radius if isinstance(loads, ModalLoads) else (0.0, 1.0)
         low, high = float(span[0]), max(float(span[1]), 0.05)
         first = {PULL: min(max(RADII[PULL], low), high), GRASP: min(RADII[GRASP], high)}
         self.radii = {

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from dpl.evaluation.nodal_fields import nodal_fields
-from dpl.fem import HasModes, write_mesh
+from dpl.fem import ModalLoads, write_mesh
 from dpl.fem.mesh import write_collection
 from dpl.inference.answer import relative
 from dpl.system.files import atomic_write
@@ -168,7 +168,7 @@ def rotating_load(body: Body) -> Callable[[float], LoadRequest]:
     is not known to contain it, a load of the training is applied and removed instead.
     """
     loads, points = body.scene.loads, body.scene.problem.points.numpy()
-    low, high = loads.patch_radius if isinstance(loads, HasModes) else (RADIUS, RADIUS)
+    low, high = loads.patch_radius if isinstance(loads, ModalLoads) else (RADIUS, RADIUS)
     patch = body.patch(farthest_node(body), min(max(RADIUS, float(low)), float(high)))
     axes = np.argsort(np.ptp(points, axis=0))[: points.shape[1] - 1].tolist()
 

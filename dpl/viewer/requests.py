@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem import HasModes, Load, RigidPatch, Solution
+from dpl.fem import Load, ModalLoads, RigidPatch, Solution
 from dpl.inference import Answer, GraspAnswer, Simulator
 from dpl.scene import Scene
 
@@ -57,7 +57,7 @@ class Patch:
         """
         loads = self.scene.loads
         loaded = self.node_mask[:, None] & loads.loadable_dofs
-        if not isinstance(loads, HasModes):
+        if not isinstance(loads, ModalLoads):
             size = loads.largest_force / float(loaded.any(dim=1).sum()) ** 0.5
             axes = torch.eye(loaded.shape[1], dtype=torch.float64)
             return torch.where(loaded, size * axes[:, None], 0.0)

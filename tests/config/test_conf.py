@@ -390,7 +390,7 @@ def test_families_of_a_mixture_are_added_changed_and_removed_by_name(scene_of):
         "loads.weights={weight:3}",
     ]
     loads = scene_of(*SMALL["beam"], "loads=mixture", *changes, "solver.linear=superlu").loads
-    assert loads.names == ("patch", "point", "gravity", "weight")
+    assert tuple(loads.families) == ("patch", "point", "gravity", "weight")
     assert loads.members[0].patch_radius == [0.1, 0.2]
     assert loads.members[3].deflection == 0.1
     assert loads.sample(0, range(2)).force.any()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dpl.data.storage.acceptance import (
+from dpl.data.storage.store import (
     BINS,
     AmplitudeBin,
     acceptance_table,

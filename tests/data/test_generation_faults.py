@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 from set_files import content
 
-from dpl.data.storage.shard import read_description
+from dpl.data.storage.shard import read_shard
 from dpl.fem import ModalLoads
 
 HERE = Path(__file__)
@@ -136,7 +136,7 @@ def done(folder):
     found = 0
     for path in folder.glob("*-*.safetensors"):
         with suppress(FileNotFoundError):  # it has just been merged
-            found += len(read_description(path)["tried"])
+            found += len(read_shard(path)["tried"])
     return found
 
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from dpl.data.learning_curve import CurvePoint, describe, loads_for
+from dpl.data.sources import CurvePoint, describe, loads_for
 
 
 def curve(*pairs):

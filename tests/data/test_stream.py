@@ -12,13 +12,13 @@ import torch
 from dpl import Sample
 from dpl.data import stream as stream_module
 from dpl.data.solving.solve import LoadKey, solve_load
-from dpl.data.stream import ReplayBuffer, SampleStream, Stream
+from dpl.data.stream import ReplayBuffer, Stream, accepted_samples
 
 SEED = (0, 0)
 
 
 class Numbers:
-    """A stream like `SampleStream` without mechanics; the modulus is the number of the load.
+    """Samples like `accepted_samples` without mechanics; the modulus is the number of the load.
 
     Attributes:
         end: Number at which it ends; None: never.
@@ -74,7 +74,7 @@ def drawn(scene):
 
 def test_the_stream_is_the_accepted_loads_in_order(make_scene):
     scene = make_scene(young=[1e6, 2e11])
-    found = list(itertools.islice(SampleStream(scene, SEED, first=2), 6))
+    found = list(itertools.islice(accepted_samples(scene, SEED, first=2), 6))
     truth = scene.loads.sample(SEED, range(2, 8))
     assert [number for number, _ in found] == list(range(2, 8))
     for (number, one), force, young in zip(found, truth.force, truth.young, strict=True):
@@ -121,7 +121,7 @@ def test_samples_are_in_order_without_rejected_and_late_loads(
 ):
     monkeypatch.setattr(stream_module, "solve_loads", solve)
     monkeypatch.setattr(stream_module, "MAX_EARLY", 6)
-    stream = SampleStream(scene, SEED, workers=workers)
+    stream = accepted_samples(scene, SEED, workers=workers)
     assert taken(stream, len(numbers)) == (numbers, [drawn[k] for k in numbers])
     stream.close()
     assert not any(thread.name == "background" for thread in threading.enumerate())
@@ -129,14 +129,14 @@ def test_samples_are_in_order_without_rejected_and_late_loads(
 
 @pytest.mark.parametrize("world_size", [2, 3])
 def test_training_processes_solve_disjoint_loads_that_cover_the_stream(scene, world_size):
-    streams = [SampleStream(scene, SEED, 4, k, world_size) for k in range(world_size)]
+    streams = [accepted_samples(scene, SEED, 4 + k, world_size) for k in range(world_size)]
     seen = itertools.chain(*(taken(stream, 4)[0] for stream in streams))
     assert sorted(seen) == list(range(4, 4 + 4 * world_size))
 
 
 def test_workers_solve_the_stream_and_end_when_it_is_closed(scene, drawn):
     before = children()
-    stream = SampleStream(scene, SEED, workers=1, timeout=600.0)
+    stream = accepted_samples(scene, SEED, workers=1, timeout=600.0)
     assert taken(stream, 12) == (list(range(12)), drawn[:12])
     started = children() - before
     assert len(started) == 1
@@ -156,8 +156,8 @@ def test_loads_are_solved_ahead_but_not_without_end(scene, monkeypatch):
             yield solve_load(scene, job)
 
     monkeypatch.setattr(stream_module, "solve_loads", counted)
-    stream = SampleStream(scene, SEED, workers=1)
-    next(iter(stream))
+    stream = accepted_samples(scene, SEED, workers=1)
+    next(stream)
     assert enough.wait(60)
     stream.close()
     assert len(solved) == 1 + stream_module.AHEAD + 1, "one is taken, one waits for its place"
@@ -169,7 +169,7 @@ def test_an_error_is_raised_where_a_sample_is_needed(scene, monkeypatch):
         raise RuntimeError("12 workers died in a row")
 
     monkeypatch.setattr(stream_module, "solve_loads", faulty)
-    samples = iter(SampleStream(scene, SEED, workers=1))
+    samples = accepted_samples(scene, SEED, workers=1)
     next(samples)
     with pytest.raises(RuntimeError, match="died in a row"):
         next(samples)

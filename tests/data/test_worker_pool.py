@@ -17,7 +17,7 @@ from set_files import fields_of as content
 from dpl import Scene
 from dpl.data.solving import worker_pool
 from dpl.data.solving.solve import LoadKey
-from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
+from dpl.data.solving.worker_pool import graceful_shutdown, solve_loads
 from dpl.fem import ModalLoads
 
 SEED = (5, 0)
@@ -162,34 +162,35 @@ def _jobs(*numbers):
 # ------------------------------------------------------------------ signals
 
 
-def test_exit_raises_after_one_signal(capfd):
-    with GracefulShutdown() as stop:
-        assert not stop
-        stop.exit()
-        os.kill(os.getpid(), signal.SIGINT)
-        assert stop
-        with pytest.raises(KeyboardInterrupt):
-            stop.exit()
-    assert "again to abort" in capfd.readouterr().err
-
-
-@pytest.mark.parametrize("second", SIGNALS)
+@pytest.mark.parametrize("second", [None, *SIGNALS])
 @pytest.mark.parametrize(
     ("first", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
 )
-def test_a_second_signal_raises_at_once(first, second, raised):
-    with GracefulShutdown() as stop:
-        os.kill(os.getpid(), first)
-        with pytest.raises(raised) as end:
-            os.kill(os.getpid(), second)
-        assert stop
+def test_a_signal_ends_the_context_at_its_end_and_a_second_one_at_once(
+    capfd, first, second, raised
+):
+    seen = []
+
+    def run():
+        with graceful_shutdown() as stop:
+            seen.append(bool(stop))
+            os.kill(os.getpid(), first)
+            seen.append(bool(stop))
+            if second is not None:
+                os.kill(os.getpid(), second)
+            seen.append("end")
+
+    with pytest.raises(raised) as end:
+        run()
+    assert seen == [False, True, "end"][: 3 if second is None else 2]
+    assert "again to abort" in capfd.readouterr().err
     if raised is SystemExit:
         assert end.value.code == 143
 
 
 def test_signal_handlers_are_restored_after_an_error():
     before = [signal.getsignal(number) for number in SIGNALS]
-    with suppress(RuntimeError), GracefulShutdown():
+    with suppress(RuntimeError), graceful_shutdown():
         assert [signal.getsignal(number) for number in SIGNALS] != before
         raise RuntimeError
     assert [signal.getsignal(number) for number in SIGNALS] == before
@@ -198,7 +199,7 @@ def test_signal_handlers_are_restored_after_an_error():
 def test_another_thread_leaves_signal_handlers_unchanged():
     def enter():
         before = signal.getsignal(signal.SIGINT)
-        with GracefulShutdown() as stop:
+        with graceful_shutdown() as stop:
             return signal.getsignal(signal.SIGINT) is before, bool(stop)
 
     with ThreadPoolExecutor() as threads:
@@ -206,7 +207,7 @@ def test_another_thread_leaves_signal_handlers_unchanged():
 
 
 def test_after_a_signal_no_load_is_started_in_this_process(scene, jobs, here):
-    with GracefulShutdown() as stop:
+    with suppress(SystemExit), graceful_shutdown() as stop:
         running = solve_loads(scene, jobs, workers=0, stop=stop)
         found = [next(running), next(running)]
         os.kill(os.getpid(), signal.SIGTERM)
@@ -215,7 +216,7 @@ def test_after_a_signal_no_load_is_started_in_this_process(scene, jobs, here):
 
 
 def test_after_a_signal_only_the_solves_in_progress_are_finished(scene, jobs, here):
-    with GracefulShutdown() as stop:
+    with suppress(KeyboardInterrupt), graceful_shutdown() as stop:
         running = solve_loads(scene, jobs, workers=2, stop=stop)
         found = [next(running)]
         os.kill(os.getpid(), signal.SIGINT)

@@ -531,7 +531,7 @@ def test_a_mixture_draws_its_families_by_weight_and_names_them(linear):
     modal = partial(fem.ModalLoads, n_modes=3)
     families = {"modal": modal, "point": fem.PointLoads, "none": fem.GravityLoads}
     loads = fem.MixtureLoads(linear, families, {"modal": 3.0, "none": 0.0})
-    assert loads.names == ("modal", "point", "none")
+    assert tuple(loads.families) == ("modal", "point", "none")
     points = loads.points(0, range(4000))
     counts = torch.bincount(loads.family_of(points), minlength=3)
     assert counts[2] == 0

@@ -11,7 +11,7 @@ from solving import LENGTH, YOUNG
 from torch.testing import assert_close
 
 from dpl import fem
-from dpl.fem.loads import constant, log_tail_mixture, logarithmic, modal_basis, normal, uniform01
+from dpl.fem.loads import constant, log_tail_mixture, logarithmic, modal, normal, uniform01
 from dpl.fem.loads.sampling import SAMPLINGS
 
 REFERENCE = {  # paper's beam, independent code: eigenvalues of K(0) [N/m]
@@ -57,7 +57,7 @@ def test_modes_do_not_depend_on_the_start_of_the_iteration(beam, monkeypatch, ce
         start = np.random.default_rng(1).uniform(-1, 1, len(v0))
         return original(matrix, count, v0=start, **options)
 
-    monkeypatch.setattr(modal_basis, "eigsh", restarted)
+    monkeypatch.setattr(modal, "eigsh", restarted)
     again = fem.eigenmodes(fem.LinearSolver(problem, linear="superlu"), 5)
     assert torch.allclose(again.vectors, first.vectors, rtol=0, atol=1e-8)
 

@@ -108,11 +108,9 @@ def _solve_near(scene: Scene, load: Load, guess: Tensor) -> Solution | None:
 def failed_load(scene: Scene, job: LoadKey, reason: str, seconds: float = 0.0) -> SolvedLoad:
     """Return a rejected load whose solve did not end: a time-out or a dead worker."""
     load, point = _draw(scene, job)
-    force = load.force[0].numpy()
-    return SolvedLoad(
-        *(job, point, force, 0 * force, _amplitude(scene, load), False, np.nan, np.nan),
-        *(0.0, 0, seconds, reason),
-    )
+    force, amplitude = load.force[0].numpy(), _amplitude(scene, load)
+    solution = 0 * force, amplitude, False, np.nan, np.nan, 0.0, 0, seconds, reason
+    return SolvedLoad(job, point, force, *solution)
 
 
 def _amplitude(scene: Scene, load: Load) -> float:

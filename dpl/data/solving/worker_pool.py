@@ -35,48 +35,40 @@ STARTUP_GRACE = 120.0  # additional time for the first load of a worker: imports
 RETRY_DELAY = 8  # loads that are solved before a load whose worker died is tried again
 
 
-class GracefulShutdown:
-    """Context manager that turns the first SIGINT or SIGTERM into a flag, which is its truth value.
+@contextlib.contextmanager
+def graceful_shutdown() -> Iterator[list[int]]:
+    """Yield the list of the signals received: empty, and therefore false, until the first one.
 
-    The second one raises KeyboardInterrupt, or SystemExit if the first one was a SIGTERM.
+    A SIGINT or SIGTERM raises KeyboardInterrupt or SystemExit at the end of the context. A second
+    one raises it at once. In a thread other than the main one, signals have their usual effect.
     """
+    received: list[int] = []
 
-    def __init__(self) -> None:
-        """Start without a request."""
-        self._requested = 0
-        self._previous: dict[int, Any] = {}
+    def leave() -> None:
+        if received[0] == signal.SIGTERM:
+            sys.exit(128 + signal.SIGTERM)
+        raise KeyboardInterrupt
 
-    def __enter__(self) -> "GracefulShutdown":
-        """Install the signal handlers, which is possible in the main thread only."""
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._handle)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Restore the previous signal handlers."""
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._requested:
-            for each in self._previous:  # the termination of the workers must not be interrupted
+    def handle(number: int, _: FrameType | None) -> None:
+        received.append(number)
+        if len(received) > 1:
+            for each in previous:  # the termination of the workers must not be interrupted
                 signal.signal(each, signal.SIG_IGN)
-            self.exit()
-        self._requested = number
+            leave()
         # not print, which is not reentrant and may be what the signal has interrupted
         os.write(2, b"\nFinishing the solves in progress. Press Ctrl-C again to abort.\n")
 
-    def __bool__(self) -> bool:
-        """Return True after the first signal."""
-        return self._requested != 0
-
-    def exit(self) -> None:
-        """Raise KeyboardInterrupt or SystemExit after a signal; do nothing without one."""
-        if self._requested == signal.SIGTERM:
-            sys.exit(128 + signal.SIGTERM)
-        if self._requested:
-            raise KeyboardInterrupt
+    previous: dict[int, Any] = {}
+    try:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                previous[number] = signal.signal(number, handle)
+        yield received
+    finally:
+        for each, handler in previous.items():
+            signal.signal(each, handler)
+    if received:
+        leave()
 
 
 def solve_loads(

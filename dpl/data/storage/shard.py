@@ -5,6 +5,7 @@ metadata of a file hold the SHA-256 of its name and its columns.
 """
 
 import hashlib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -88,42 +89,26 @@ def digest(name: str, columns: Columns) -> str:
     return found.hexdigest()
 
 
-def read_description(path: Path) -> Columns:
-    """Return the columns of `DESCRIPTION`, see `read_shard`; the digest is not checked."""
-    return _read(path, DESCRIPTION, None)
-
-
 def read_shard(
-    path: Path, shape: tuple[int, ...], dimension: int, n_parameters: int = 0
+    path: Path, shape: Sequence[int] | None = None, dimension: int = 0, n_parameters: int = 0
 ) -> Columns:
-    """Return the columns of a shard.
+    """Return the columns of a shard; without `shape` those of `DESCRIPTION`, digest unchecked.
 
-    Args:
-        path: The file.
-        shape: (N, D).
-        dimension: d, number of coordinates of the point that a load is drawn from.
-        n_parameters: P, number of parameters of a load.
+    `shape` is (N, D). A load is drawn from a point with `dimension` coordinates.
 
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: A column is missing or has a wrong shape, type or value, or the digest is wrong.
             The message continues a sentence that starts with the name of the file.
     """
-    return _read(path, (*TRIED, *SOLUTIONS, "reason"), (shape, dimension, n_parameters))
-
-
-_Sizes = tuple[tuple[int, ...], int, int]  # (N, D), d and P
-
-
-def _read(path: Path, names: Sequence[str], sizes: _Sizes | None) -> Columns:
-    """Return some columns of a file; None as sizes for those of a description."""
+    names = DESCRIPTION if shape is None else (*TRIED, *SOLUTIONS, "reason")
     try:
         with safe_open(path, "pt") as file:
             # copied, because the memory of the tensors is that of the file
             columns = {name: file.get_tensor(name).clone() for name in names}
             stored = (file.metadata() or {}).get("sha256")
-        flaw = _flaw(columns, sizes)
-        if sizes and not flaw and stored != digest(path.name, columns):
+        flaw = _flaw(columns, shape, dimension, n_parameters)
+        if shape is not None and not flaw and stored != digest(path.name, columns):
             flaw = "the SHA-256 of its name and its columns is wrong"
     except (SafetensorError, KeyError, TypeError, RuntimeError) as error:
         flaw = str(error)
@@ -132,51 +117,34 @@ def _read(path: Path, names: Sequence[str], sizes: _Sizes | None) -> Columns:
     return columns
 
 
-def _flaw(columns: Columns, sizes: _Sizes | None) -> str:
-    """Return the first flaw of some columns; empty without one."""
+def _flaw(columns: Columns, shape: Sequence[int] | None, dimension: int, n_parameters: int) -> str:
+    """Return the first flaw of the columns that `read_shard` reads; empty without one."""
     count, accepted = len(columns["tried"]), len(columns["index"])
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(TRIED, (count,))
     shapes |= {"index": (accepted,), "reason": (count - accepted, REASON)}
-    shapes |= {"n_loaded_nodes": (accepted,)} if sizes else {}
-    if flaw := _flaw_of_shapes(columns, shapes):
-        return flaw
-    tried, index, iterations = (columns[name] for name in ("tried", "index", "iterations"))
-    if not count or (tried.diff() <= 0).any() or not 0 <= tried[0] <= tried[-1] < MAX_INTEGER:
-        return "the numbers of its loads are not ascending"
-    if (index.diff() <= 0).any() or not torch.isin(index, tried).all():
-        return "an accepted load was not tried"
-    if not ((iterations >= 0) & (iterations < MAX_INTEGER)).all():
-        return "a number of iterations is out of range"
-    if not (columns["amplitude"] >= 0).all():
-        return "an amplitude is negative"
-    if sizes is None:
-        return ""
-    (nodes, dim), dimension, n_parameters = sizes
-    n_loaded_nodes = int(columns["n_loaded_nodes"].sum())
-    shapes = dict.fromkeys(("residual", "volume_ratio"), (accepted,)) | {
-        "point": (accepted, dimension),
-        "node": (n_loaded_nodes,),
-        "nodal_force": (n_loaded_nodes, dim),
-        "displacement": (accepted, nodes, dim),
-        "parameters": (accepted, n_parameters),
-    }
-    if flaw := _flaw_of_shapes(columns, shapes):
-        return flaw
-    if not ((columns["n_loaded_nodes"] >= 0) & (columns["n_loaded_nodes"] <= nodes)).all():
-        return "a number of loaded nodes is negative or exceeds N"
-    if not ((columns["node"] >= 0) & (columns["node"] < nodes)).all():
-        return "a loaded node does not exist"
-    return ""
-
-
-def _flaw_of_shapes(columns: Columns, shapes: Mapping[str, tuple[int, ...]]) -> str:
-    """Return the error of the first column of wrong shape, type or value; empty without one."""
+    if shape is not None:
+        loaded = int(columns["n_loaded_nodes"].long().sum())
+        shapes |= dict.fromkeys(("residual", "volume_ratio", "n_loaded_nodes"), (accepted,))
+        shapes |= {"point": (accepted, dimension), "parameters": (accepted, n_parameters)}
+        shapes |= {"node": (loaded,), "nodal_force": (loaded, shape[1])}
+        shapes |= {"displacement": (accepted, *shape)}
     for name, expected in shapes.items():
         column = columns[name]
         if (tuple(column.shape), column.dtype) != (expected, INTEGERS.get(name, torch.float64)):
             return f"{name} has shape and type {tuple(column.shape)}, {column.dtype}"
         if name in FINITE and not column.isfinite().all():
             return f"{name} is not finite"
+    tried, index = columns["tried"], columns["index"]
+    if not count or (tried.diff() <= 0).any() or not 0 <= tried[0] <= tried[-1] < MAX_INTEGER:
+        return "the numbers of its loads are not ascending"
+    if (index.diff() <= 0).any() or not torch.isin(index, tried).all():
+        return "an accepted load was not tried"
+    spans = {"iterations": MAX_INTEGER, "amplitude": math.inf}
+    if shape is not None:
+        spans |= {"n_loaded_nodes": shape[0] + 1, "node": shape[0]}
+    for name, end in spans.items():
+        if not ((columns[name] >= 0) & (columns[name] < end)).all():
+            return f"{name} is out of range"
     return ""
 
 

@@ -14,7 +14,7 @@ import math
 import re
 import stat
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import groupby
@@ -26,13 +26,11 @@ import torch
 from torch import Tensor
 
 from dpl.data.solving.solve import SolvedLoad
-from dpl.data.storage.acceptance import AmplitudeBin, acceptance_table, amplitude_bins
 from dpl.data.storage.shard import (
     REASON,
     Columns,
     encode_load,
     encode_shard,
-    read_description,
     read_shard,
     reasons,
     single_loads,
@@ -48,6 +46,23 @@ STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
 SHARD_NAME = re.compile(rf"({'|'.join(STREAMS)})-(\d{{6,16}})\.safetensors")
 HEADER = 100_000  # largest size of a shard without its numbers [bytes]
 SHARD_SIZE = 64  # loads in one block, and at most in one file
+BINS = 10  # of amplitudes
+MIN_ACCEPTANCE = 0.9  # accepted fraction of a bin below which the data set is biased
+MIN_LOADS = 10  # tried loads below which a bin is not judged
+
+
+class AmplitudeBin(NamedTuple):
+    """Numbers of loads in a range of amplitudes ||f|| / ||Phi q_max|| [-]."""
+
+    low: float
+    high: float
+    tried: int
+    accepted: int
+
+    @property
+    def biased(self) -> bool:
+        """True if too large a fraction of the loads was rejected."""
+        return self.tried >= MIN_LOADS and self.accepted < MIN_ACCEPTANCE * self.tried
 
 
 class Shard(NamedTuple):
@@ -132,7 +147,7 @@ class Store:
     def describe(self, path: Path) -> Shard:
         """Return a shard without its solutions; raise ValueError if it is damaged."""
         self._check_file(path)
-        name, columns = SHARD_NAME.fullmatch(path.name), read_description(path)
+        name, columns = SHARD_NAME.fullmatch(path.name), read_shard(path)
         if name is None or int(name[2]) != columns["tried"][0]:
             raise ValueError("has another name than that of its first load")
         return Shard(path, name[1], columns)
@@ -192,7 +207,19 @@ class Store:
 
         Another thread or process may solve loads of the data set at the same time.
         """
-        parts = self._columns(split, first, count)
+        while True:
+            parts = []
+            with suppress(FileNotFoundError):  # another writer merges files: read them again
+                for shard in self.shards(split):
+                    if any(first <= number < count for number in shard.tried):
+                        try:
+                            parts.append(self.read(shard.path))
+                        except ValueError as error:
+                            raise DataSetError(
+                                f"{shard.path} {error}; scripts/generate.py action=repair with the "
+                                "same scene solves its loads again"
+                            ) from None
+                break
         number = np.concatenate([np.zeros(0, int), *(part["index"].numpy() for part in parts)])
         # a load may be in two files if a writer was killed while it merged them
         rows = np.unique(number, return_index=True)[1]
@@ -205,22 +232,6 @@ class Store:
             for name in ("displacement", "point", "parameters")
         )
         return Sample(force, displacement, self.scene.loads.young_at(point), parameters)
-
-    def _columns(self, split: str, first: int, count: int) -> list[Columns]:
-        """Return the columns of the shards with any of loads `first` to `count` - 1."""
-        while True:
-            found = []
-            with suppress(FileNotFoundError):  # another writer merges files: read them again
-                for path, _, columns in self.shards(split):
-                    if any(first <= number < count for number in columns["tried"].tolist()):
-                        try:
-                            found.append(self.read(path))
-                        except ValueError as error:
-                            raise DataSetError(
-                                f"{path} {error}; scripts/generate.py action=repair with the same "
-                                "scene solves its loads again"
-                            ) from None
-                return found
 
     def write(self, solved: SolvedLoad) -> None:
         """Write a solved load to a file of its own."""
@@ -315,3 +326,40 @@ def blocks(numbers: Iterable[int]) -> Iterator[tuple[int, list[int]]]:
     """Yield the blocks of some loads in ascending order, each with its number and these loads."""
     for block, members in groupby(numbers, lambda number: number // SHARD_SIZE):
         yield block, list(members)
+
+
+def amplitude_bins(amplitudes: Sequence[float], accepted: Sequence[bool]) -> list[AmplitudeBin]:
+    """Return the bins of equal width from 0 to the largest amplitude that are not empty."""
+    if not len(amplitudes):
+        return []
+    limits = (0.0, max(amplitudes) or 1.0)
+    tried, edges = np.histogram(amplitudes, BINS, limits)
+    kept, _ = np.histogram(np.asarray(amplitudes)[np.asarray(accepted)], BINS, limits)
+    bins = zip(edges[:-1].tolist(), edges[1:].tolist(), tried.tolist(), kept.tolist(), strict=True)
+    return [AmplitudeBin(*part) for part in bins if part[2]]
+
+
+def acceptance_table(bins: Sequence[AmplitudeBin]) -> list[str]:
+    """Return two lines of text, if there are bins: their upper limits, accepted of tried loads."""
+    if not bins:
+        return []
+    rows = {
+        "amplitude up to": [f"{part.high:.2f}" for part in bins],
+        "accepted": [f"{part.accepted}/{part.tried}" for part in bins],
+    }
+    width = max(len(text) for row in rows.values() for text in row)
+    cells = {name: "".join(f"  {text:>{width}}" for text in row) for name, row in rows.items()}
+    return [f"{name:>15}{row}" for name, row in cells.items()]
+
+
+def bias_warning(bins: Sequence[AmplitudeBin]) -> str:
+    """Return a warning for the bin with the lowest acceptance; empty if no bin is biased."""
+    biased = [part for part in bins if part.biased]
+    if not biased:
+        return ""
+    worst = min(biased, key=lambda part: part.accepted / part.tried)
+    return (
+        f"the data set is biased: only {worst.accepted} of {worst.tried} loads with amplitudes "
+        f"{worst.low:.2f} to {worst.high:.2f} were accepted; lower loads.deflection, or "
+        "read the reasons in the summary of scripts/generate.py"
+    )

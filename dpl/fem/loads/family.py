@@ -74,6 +74,8 @@ class LoadFamily(Protocol):
         self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0
     ) -> Load:
         """Return loads `indices` of the stream `seed`, their forces multiplied by `amplitude`."""
+        load = self.loads_at(self.points(seed, indices))
+        return load._replace(force=amplitude * load.force)
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return amplitudes (B,) and distances (B,) of forces (B, N, D) [-] from the family.
@@ -93,19 +95,7 @@ class LoadFamily(Protocol):
 
     def skipped_work(self) -> list[str]:
         """Return notes for the plan that a command prints, one line each."""
-
-
-@runtime_checkable
-class HasModes(Protocol):
-    """Load family whose forces are combinations of modes on a part of the boundary."""
-
-    @property
-    def modal_forces(self) -> Tensor:
-        """Mode times its largest modal load, zero on degrees of freedom without load, (N, D, M)."""
-
-    @property
-    def patch_radius(self) -> Sequence[float]:
-        """Smallest and largest radius of the loaded area over L [-]."""
+        return []
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,12 +184,6 @@ class RandomLoads(LoadFamily):
         columns = [ends.at(column) for ends, column in pairs]
         return torch.stack(columns, dim=1) if columns else own
 
-    def sample(
-        self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0
-    ) -> Load:
-        load = self.loads_at(self.points(seed, indices))
-        return load._replace(force=amplitude * load.force)
-
     def own_force(self, force: Tensor) -> Tensor:
         """Return forces (B, N, D) [-] on free degrees of freedom, without `constant_force`."""
         own = force if self.constant_force is None else force - self.constant_force
@@ -218,9 +202,6 @@ class RandomLoads(LoadFamily):
 
     def identity(self) -> dict[str, Any]:
         return identity_of(self, exclude=("linear", "young"))
-
-    def skipped_work(self) -> list[str]:
-        return []
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle with what the largest force needs, so that workers need not compute it again."""

@@ -16,6 +16,7 @@ from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import CombinedLoads
 from dpl.fem.mesh.nodal_fields import read_nodal_fields
 from dpl.fem.options import option
+from dpl.system.checks import named_errors
 
 BUCKETS = 256  # numbers of a sketch
 CANDIDATES = 4  # forces with the most similar sketches, which are compared with a force
@@ -51,7 +52,7 @@ class FileLoads(CombinedLoads):
     def _forces(self) -> Array:
         """Forces of the file, (S, N, D) [N]."""
         body, names = self.problem, [self.field]
-        try:
+        with named_errors(f"path = {self.path}: "):
             (forces,) = read_nodal_fields(self.path, names, body.points_in_metres, self.scale)
             for number, force in enumerate(forces):
                 if not np.isfinite(force).all():
@@ -59,9 +60,6 @@ class FileLoads(CombinedLoads):
                 if not force[body.free.numpy()].any():
                     raise ValueError(f"force {number} must act on a free degree of freedom")
             return self.unit * forces
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-            raise ValueError(f"path = {self.path}: {' '.join(str(reason).split())}") from error
 
     @cached_property
     def shapes(self) -> Tensor:

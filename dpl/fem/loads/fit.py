@@ -1,10 +1,8 @@
 """Least-squares fit of a force by a few fixed forces, by which families recognise their loads."""
 
-import math
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,19 +21,18 @@ def fit(
     are linearly dependent, the coefficients with the smallest norm are returned, or coefficients in
     [low, high] of the same fit if those are not. A zero force has the residual 0.
     """
-    unit = float(np.abs(force).max(initial=0.0))
+    unit, count = float(np.abs(force).max(initial=0.0)), shapes.shape[-1]
     if unit == 0:
-        return np.zeros(shapes.shape[-1]), 0.0
-    count = shapes.shape[-1]
-    q, right, gram = np.zeros(count), np.zeros(count), np.zeros((count, count))
-    whole = _normal_equations(shapes, force, unit, q, gram, right)
-    sizes, axes = np.linalg.eigh(gram)
+        return np.zeros(count), 0.0
+    loaded = np.flatnonzero(force.any(axis=1))
+    matrix, rest = shapes[loaded].reshape(-1, count), force[loaded].ravel() / unit
+    sizes, axes = np.linalg.eigh(matrix.T @ matrix)
     inverse = np.where(sizes > LEAST_SQUARE * sizes[-1], 1 / np.maximum(sizes, 1e-300), 0.0)
-    q = axes @ (inverse * (right @ axes))
-    # the second time removes the rounding error of the normal equations
-    rest = _normal_equations(shapes, force, unit, q, gram[:0], right)
-    step = axes @ (inverse * (right @ axes))
-    q, residual = unit * (q + step), math.sqrt(max(rest - step @ right, 0.0) / whole)
+    q, whole = np.zeros(count), np.linalg.norm(rest)
+    for _ in range(2):  # the second time removes the rounding error of the normal equations
+        step = axes @ (inverse * (rest @ matrix @ axes))
+        q, rest = q + step, rest - matrix @ step
+    q, residual = unit * q, float(np.linalg.norm(rest) / whole)
     if inverse.all() or low <= q.min() <= q.max() <= high:
         return q, residual
     from scipy.optimize import lsq_linear  # its import is not needed for independent shapes
@@ -55,37 +52,11 @@ def project(
 ) -> tuple[Tensor, Tensor]:
     """Return the largest amplitudes and the relative residuals of forces (B, N, D), (B,) each.
 
-    `fit` has shapes (N, D, K) and the range of the coefficients, span; `amplitude` maps the
-    coefficients (K,) to amplitudes, (K,) or (1,).
+    `amplitude` maps coefficients (K,), of the range `span`, to amplitudes, (K,) or (1,).
     """
     fits = [fit(shapes, force, *span) for force in forces.numpy()]
     largest = [amplitude(coefficients).max() for coefficients, _ in fits]
     return forces.new_tensor(largest), forces.new_tensor([residual for _, residual in fits])
-
-
-@njit(cache=True)
-def _normal_equations(shapes, force, unit, q, gram, right):  # type: ignore[no-untyped-def]
-    """Set S^T S, unless (0, K), and S^T r with r = f / unit - S q; return |r|^2."""
-    nodes, dim, count = shapes.shape
-    gram[:], right[:], square = 0.0, 0.0, 0.0
-    for node in range(nodes):
-        is_loaded = False
-        for i in range(dim):
-            is_loaded = is_loaded or force[node, i] != 0.0
-        if not is_loaded:
-            continue
-        for i in range(dim):
-            row = shapes[node, i]
-            rest = force[node, i] / unit
-            for k in range(count):
-                rest -= row[k] * q[k]
-            for k in range(count):
-                right[k] += row[k] * rest
-            for k in range(len(gram)):
-                for j in range(count):
-                    gram[k, j] += row[k] * row[j]
-            square += rest * rest
-    return square
 
 
 def amplitudes(sizes: Array, low: float, high: float, largest: float) -> Array:

@@ -39,7 +39,7 @@ class Traction:
         """Return the nodal forces (N, D) over E L^(D - 1) [-]."""
         value = vector("value", self.value, problem.shape[1], "Pa")
         stress = problem.units.stress(value, f"value = {list(self.value)}")
-        return traction(problem, self.region, _constant(stress), problem.length)
+        return traction(problem, self.region, lambda _: stress[:, None, None], problem.length)
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,8 @@ class BodyForce:
             assert self.density is not None
             words = f"acceleration = {list(self.acceleration)} times density = {self.density}"
             density = self.density * vector("acceleration", self.acceleration, dim, "m/s^2")
-        return body_force(problem, _constant(problem.units.stress_gradient(density, words)))
-
-
-def _constant(value: NDArray[np.float64]) -> Field:
-    """Return the field that is `value` everywhere."""
-    return lambda x: np.multiply.outer(value, np.ones(x.shape[1:]))
+        gradient = problem.units.stress_gradient(density, words)
+        return body_force(problem, lambda _: gradient[:, None, None])
 
 
 def body_force(problem: Problem, density: Field) -> Tensor:

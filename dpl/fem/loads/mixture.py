@@ -46,15 +46,10 @@ class MixtureLoads(RandomLoads):
         self.members  # noqa: B018  # raises if a family cannot be built
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the families, in the order of their numbers."""
-        return tuple(self.families)
-
-    @property
     def _weights(self) -> list[float]:
         """Weight of each family."""
         weights = self.weights or {}
-        return [float(weights.get(name, 1.0)) for name in self.names]
+        return [float(weights.get(name, 1.0)) for name in self.families]
 
     @cached_property
     def members(self) -> tuple[RandomLoads, ...]:
@@ -94,7 +89,7 @@ class MixtureLoads(RandomLoads):
     def largest_force(self) -> float:
         """Largest of the largest forces of the families [-]."""
         sizes = []
-        for name, member in zip(self.names, self.members, strict=True):
+        for name, member in zip(self.families, self.members, strict=True):
             with named_errors(f"families.{name}: "):
                 sizes.append(member.largest_force)
         return max(sizes)
@@ -114,7 +109,7 @@ class MixtureLoads(RandomLoads):
 
     def identity(self) -> dict[str, Any]:
         """Return the options with the identities of the families."""
-        members = zip(self.names, self.members, strict=True)
+        members = zip(self.families, self.members, strict=True)
         families = {name: member.identity() for name, member in members}
         weights = np.array(self._weights) / sum(self._weights)
         return super().identity() | {"families": families, "weights": rounded(weights)}

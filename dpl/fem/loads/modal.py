@@ -1,4 +1,4 @@
-"""Random modal loads on random areas of the boundary.
+"""Random modal loads on random areas of the boundary, and eigenmodes of K(0).
 
 Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.2.2: f = Phi q with a few
 eigenmodes of K(0), restricted to random areas of the boundary.
@@ -8,20 +8,37 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 from torch import Tensor
 
+from dpl.fem.linear.interface import SingularMatrix, full_matrix
 from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.fit import amplitudes, project
-from dpl.fem.loads.modal_basis import Modes, eigenmodes
 from dpl.fem.loads.sampling import Array, Quantile, constant, symmetric_uniform, uniform01
 from dpl.fem.loads.sized import MIN_DEFLECTION
 from dpl.fem.options import option
+from dpl.fem.problem import Problem
+from dpl.fem.solvers.linear import LinearSolver
 
 TESTED = np.linspace(0.0, 1 - 2.0**-53, 1001)  # numbers at which distributions are examined
+SAME = 1e-6  # eigenvalues closer than this, relatively, are one eigenspace
+CLUSTER = 0.05  # eigenvalues closer than this belong to one family and are excited together
+
+
+class Modes(NamedTuple):
+    """Lowest eigenpairs of K(0) on the free degrees of freedom.
+
+    Attributes:
+        values: Eigenvalues, ascending, (M,) [-].
+        vectors: Orthonormal eigenvectors, zero where held, (N, D, M) [-].
+    """
+
+    values: Tensor
+    vectors: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,3 +164,73 @@ class ModalLoads(SurfaceLoads):
         if self.modes is not None or count == self.n_modes:
             return []
         return [f"{count} modes instead of {self.n_modes}: a cluster of eigenvalues is kept whole"]
+
+
+def eigenmodes(linear: LinearSolver, count: int) -> Modes:
+    """Return the lowest modes, those of the last family all: `count` or a few more.
+
+    Shift-invert Lanczos around zero with the stored factor of K(0). The same problem gives the
+    same vectors: within an eigenspace the basis is the one that leans on the fields 1, x, y, z,
+    x^2, ... in turn, with positive sign.
+
+    Args:
+        linear: The body, held, with the factor of its K(0).
+        count: How many modes at least.
+
+    Raises:
+        ValueError: `count` is not between 1 and a third of the degrees of freedom, or the body is
+            free to move.
+        SingularMatrix: The moduli are so far apart that rounding leaves no mode.
+    """
+    linear = linear.reference
+    problem = linear.problem
+    size = problem.pattern.size
+    if not 1 <= count <= size // 3:
+        raise ValueError(f"n_modes = {count} must lie between 1 and {size // 3}")
+    if loose := problem.unconstrained_rigid_body_modes():
+        raise ValueError(f"{len(loose)} rigid modes are unconstrained: {', '.join(loose)}")
+    stiffness = full_matrix(problem.pattern, problem.stiffness_at_rest().numpy())
+    inverse = LinearOperator((size, size), matvec=linear.factor.solve, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal(size)
+    requested = min(count + 8, size - 2)
+    try:
+        values, vectors = eigsh(stiffness, requested, sigma=0.0, OPinv=inverse, v0=start, tol=1e-12)
+    except ArpackError as error:
+        raise SingularMatrix("its modes cannot be found") from error
+    order = np.argsort(values)
+    values, vectors = values[order], vectors[:, order]
+    while count < requested and values[count] - values[count - 1] < CLUSTER * values[count]:
+        count += 1
+    probes = _probes(problem)
+    cuts = np.flatnonzero(np.diff(values) > SAME * values[1:]) + 1
+    for low, high in pairwise([0, *cuts.tolist(), len(values)]):
+        vectors[:, low:high] = _leaning(vectors[:, low:high], probes)
+    fields = torch.stack([problem.extend(vector) for vector in vectors[:, :count].T], dim=-1)
+    return Modes(torch.from_numpy(values[:count]), fields)
+
+
+def _probes(problem: Problem) -> Array:
+    """Return fields (n, P): monomials up to degree 2 in each component, then fixed noise."""
+    x = problem.points - problem.points.mean(dim=0)
+    x, dim = x / x.abs().max(), x.shape[1]
+    monomials = [torch.ones(len(x), dtype=torch.float64), *x.T]
+    monomials += [x[:, i] * x[:, j] for i in range(dim) for j in range(i, dim)]
+    axes = torch.eye(dim, dtype=torch.float64)
+    fields = [problem.restrict(m[:, None] * axis) for m in monomials for axis in axes]
+    noise = np.random.default_rng(1).standard_normal((len(fields[0]), 4))
+    return np.column_stack([*fields, noise])
+
+
+def _leaning(basis: Array, probes: Array) -> Array:
+    """Return the basis of span(basis), (n, m), whose k-th vector is the k-th new probe in it."""
+    sizes = np.linalg.norm(probes, axis=0)  # 0 of x^2 where all x are 0
+    shadows = basis.T @ (probes / np.where(sizes > 0, sizes, 1.0))  # (m, P)
+    chosen = np.zeros((len(shadows), 0))
+    for shadow in shadows.T:
+        rest = shadow - chosen @ (chosen.T @ shadow)
+        if np.linalg.norm(rest) > 1e-4:
+            rest -= chosen @ (chosen.T @ rest)
+            chosen = np.column_stack([chosen, rest / np.linalg.norm(rest)])
+        if chosen.shape[1] == len(shadows):
+            break
+    return basis @ chosen

@@ -15,7 +15,7 @@ from torch import Tensor
 from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.forces import ROUNDOFF, facet_areas
 from dpl.fem.loads.sampling import Array
-from dpl.fem.loads.sized import SizedLoads, largest_deflection, softest_node
+from dpl.fem.loads.sized import SizedLoads, deflections, softest_node
 from dpl.fem.options import option
 
 MAX_ROUNDS = 5  # of decisions about loaded facets; a disc away from supports needs one or two
@@ -46,7 +46,7 @@ class PatchLoads(SurfaceLoads, SizedLoads):
         vertex = int(self.centres[np.flatnonzero(nodes[self.centres] == softest)[0]])
         axes = torch.eye(self.problem.shape[1], dtype=torch.float64)
         weights = self.weights_of(vertex, self.patch_radius[1])
-        return largest_deflection(linear, torch.einsum("n,kd->knd", weights, axes))
+        return float(deflections(linear, torch.einsum("n,kd->knd", weights, axes)).max())
 
     @property
     def largest_force(self) -> float:
@@ -88,7 +88,8 @@ class PatchLoads(SurfaceLoads, SizedLoads):
             return 0.0, 1.0
         traction = tractions[:, norms.argmax()]
         parts = _parts(tractions, traction, free)
-        for _ in range(self._partly_fixed * (len(traction) - 1)):  # components fixed at that node
+        is_partly_fixed = bool((free.any(axis=0) & ~free.all(axis=0)).any())  # at some node
+        for _ in range(is_partly_fixed * (len(traction) - 1)):  # components fixed at that node
             known = np.nan_to_num(parts)
             traction = tractions @ known / np.maximum(free @ known**2, 1e-300)
             parts = _parts(tractions, traction, free)
@@ -134,12 +135,6 @@ class PatchLoads(SurfaceLoads, SizedLoads):
         dofs, is_node = np.arange(self.problem.free.numel()).reshape(self.problem.shape), sizes != 0
         free = self.problem.free.numpy()[is_node].astype(np.float64).T.copy()
         return dofs[is_node].T.copy(), dofs[~is_node], sizes[is_node], free, self._areas[is_node]
-
-    @cached_property
-    def _partly_fixed(self) -> bool:
-        """True if some but not all components of a node are fixed."""
-        free = self._loadable[3]
-        return bool((free.any(axis=0) & ~free.all(axis=0)).any())
 
     @cached_property
     def _shares(self) -> tuple[NDArray[np.int_], Array, Array]:

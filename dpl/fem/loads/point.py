@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.sampling import Array
-from dpl.fem.loads.sized import SizedLoads, largest_deflection, point_forces, softest_node
+from dpl.fem.loads.sized import SizedLoads, deflections, point_forces, softest_node
 from dpl.fem.options import option
 
 
@@ -44,7 +44,7 @@ class PointLoads(SurfaceLoads, SizedLoads):
         """Largest linear deflection [-] of all forces of size 1 at the softest node."""
         linear = self.linear.reference
         axes = point_forces(self.problem.shape, [softest_node(linear, self.nodes)])
-        return self.count[1] * largest_deflection(linear, axes)
+        return self.count[1] * float(deflections(linear, axes).max())
 
     @property
     def largest_force(self) -> float:

@@ -5,15 +5,10 @@ every distribution goes with every way to fill the unit cube.
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
-
-if TYPE_CHECKING:
-    from scipy.stats import qmc
 
 Array = NDArray[np.float64]
 Quantile = Callable[[Array], Array]  # uniform in [0, 1) -> what is drawn, of the same shape
@@ -31,19 +26,13 @@ def sobol(seed: int | Sequence[int], index: int, count: int) -> Array:
 
     Source: Sobol (1967); Owen (1998), J. Complexity 14; Joe, Kuo (2008).
     """
-    key = (seed,) if isinstance(seed, int) else tuple(seed)
-    sequence = _sobol(key, count)
-    sequence.reset()
-    if index:
-        sequence.fast_forward(index)
-    return sequence.random(1)[0].copy()  # the first point would be a view
-
-
-@lru_cache(maxsize=8)
-def _sobol(seed: tuple[int, ...], count: int) -> "qmc.Sobol":
     from scipy.stats import qmc  # its import of half a second is not needed for other samplings
 
-    return qmc.Sobol(count, scramble=True, rng=np.random.default_rng(list(seed)))
+    rng = np.random.default_rng([seed] if isinstance(seed, int) else list(seed))
+    sequence = qmc.Sobol(count, scramble=True, rng=rng)
+    if index:
+        sequence.fast_forward(index)
+    return sequence.random(1)[0]
 
 
 SAMPLINGS = {"independent": independent, "sobol": sobol}

@@ -120,10 +120,6 @@ class CombinedLoads(SizedLoads):
         """Smallest and largest coefficient [-]."""
         return self.sizes
 
-    def sizes_of(self, coefficients: Array) -> Array:
-        """Return the sizes of coefficients (K,), which have the range `sizes`."""
-        return coefficients
-
     @property
     def unit_deflection(self) -> float:
         """Largest linear deflection [-] of the sum of all f_k, if their signs add up at a node."""
@@ -155,9 +151,7 @@ class CombinedLoads(SizedLoads):
         """Return amplitudes and relative residuals of a least-squares fit, see `LoadFamily`."""
         # as of one node with N D components, so that entries without a force count, too
         shapes, own = self._acting_shapes[None], self.own_force(force).flatten(1)[:, None]
-        return project(
-            shapes, own, self.coefficient_range, lambda c: self.amplitudes(self.sizes_of(c))
-        )
+        return project(shapes, own, self.coefficient_range, self.amplitudes)
 
     @cached_property
     def _acting_shapes(self) -> Array:
@@ -192,14 +186,14 @@ class VectorLoads(CombinedLoads):
         """Smallest and largest component of a vector [-]."""
         return -self.largest_size, self.largest_size
 
-    def sizes_of(self, coefficients: Array) -> Array:
-        """Return the norm of a vector (D,), (1,)."""
-        return np.linalg.norm(coefficients[None], axis=1)
+    def amplitudes(self, sizes: Array) -> Array:
+        """Return the amplitude of a vector (D,) [-], (1,)."""
+        return super().amplitudes(np.linalg.norm(sizes[None], axis=1))
 
     @property
     def unit_deflection(self) -> float:
         """Largest linear deflection [-] of the unit vectors of all directions."""
-        return largest_deflection(self.linear.reference, self.shapes)
+        return float(deflections(self.linear.reference, self.shapes).max())
 
     @property
     def unit_force(self) -> float:
@@ -213,11 +207,6 @@ def rounded(values: Array) -> list[float]:
     return [float(f"{value:.{DIGITS}g}") for value in values]
 
 
-def largest_deflection(linear: LinearSolver, axes: Tensor) -> float:
-    """Return the largest linear deflection of a combination of axes (K, N, D), |c| = 1 [-]."""
-    return float(_moved(linear, axes).max())
-
-
 def softest_node(linear: LinearSolver, nodes: Tensor) -> int:
     """Return a node that yields most to forces of any direction, among `nodes` (n,).
 
@@ -229,7 +218,7 @@ def softest_node(linear: LinearSolver, nodes: Tensor) -> int:
     found: int | None = None
     while True:
         forces = point_forces(linear.problem.shape, nodes if found is None else [found])
-        sizes = _moved(linear, forces)
+        sizes = deflections(linear, forces)
         best = int(nodes[int(sizes[nodes].argmax())])
         if found is not None and not sizes[best] > sizes[found] * (1 + 1e-9):
             return found
@@ -244,7 +233,7 @@ def point_forces(shape: Sequence[int], nodes: Tensor | list[int]) -> Tensor:
     return forces
 
 
-def _moved(linear: LinearSolver, axes: Tensor) -> Tensor:
-    """Return the largest linear deflection of each node by c_k f_k (K, N, D) with |c| = 1, (N,)."""
+def deflections(linear: LinearSolver, axes: Tensor) -> Tensor:
+    """Return the largest deflection of each node by c_k f_k (K, N, D) with |c| = 1, (N,) [-]."""
     moved = torch.stack([linear.solve_force(force) for force in axes], dim=-1)  # (N, D, K)
     return torch.linalg.matrix_norm(moved, 2)
