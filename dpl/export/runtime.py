@@ -111,6 +111,7 @@ def _checked_law(net: Any, scene: Scene) -> InvariantBasedMaterial:
         f"have one of the laws {', '.join(LAWS.values())}; use outputs=[model]": known,
         "have no mean dilatation; use outputs=[model]": problem.volume_functions is None,
         "have no elastic foundation; use outputs=[model]": problem.springs is None,
+        "have no follower loads; use outputs=[model]": not problem.follower_loads,
         "be fitted with model=unrolled; use outputs=[model]": hasattr(net, "first_map")
         and net.is_fitted,
     }

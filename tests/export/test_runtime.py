@@ -406,11 +406,13 @@ def test_the_example_prints_error_and_time_of_each_frame(written, programs):
 
 BEAM = fem.box((2, 1, 1), (3, 2, 2))
 FOUNDATION = fem.RobinBC(fem.Plane(1, "min"), 1.0)
+PRESSURE = fem.FollowerPressure(fem.Plane(1, "min"), 1e-3)
 REFUSED = {
     "three-dimensional": lambda: scene_on(fem.rectangle((4, 1), (5, 2))),
     r"no ranges \['poisson'\]": lambda: scene_on(BEAM, fem.NeoHookeanLn((0.1, 0.4))),
     "one of the laws": lambda: scene_on(BEAM, ALL_LAWS["ogden_k2"]),
     "no elastic foundation": lambda: scene_on(BEAM, supports=[FOUNDATION]),
+    "no follower loads": lambda: scene_on(BEAM, follower_loads=[PRESSURE]),
     "no mean dilatation": lambda: scene_on(BEAM, mean_dilatation=True),
     "fitted with model=unrolled": lambda: scene_on(BEAM),
 }
