@@ -27,25 +27,16 @@ def orthogonal(matrix: Tensor) -> Tensor:
     tall = matrix.size(0) > matrix.size(1)
     x = matrix.T if tall else matrix
     x = x / x.norm().clamp(min=1e-7)
-    if x.dtype == torch.float32 and x.size(1) >= LONG * x.size(0):
-        x = _polynomial(x @ x.T) @ x
-        return x.T if tall else x
-    for _ in range(ITERATIONS):
-        gram = x @ x.T
-        x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
-    return x.T if tall else x
-
-
-def _polynomial(gram: Tensor) -> Tensor:
-    """Return P, (n, n), of the last iterate P X, from X X^T, (n, n)."""
-    a, b, c = QUINTIC
-    eye = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
-    product = eye
-    for _ in range(ITERATIONS):
+    is_long = x.dtype == torch.float32 and x.size(1) >= LONG * x.size(0)
+    gram, eye = x @ x.T, torch.eye(len(x), dtype=x.dtype, device=x.device)
+    iterate = eye if is_long else x  # P or P X
+    for step in range(1, ITERATIONS + 1):
         factor = torch.addmm(gram, gram, gram, beta=b, alpha=c) + a * eye
-        product = factor @ product
-        gram = factor @ gram @ factor
-    return product
+        iterate = factor @ iterate
+        if step < ITERATIONS:
+            gram = factor @ gram @ factor if is_long else iterate @ iterate.T
+    x = iterate @ x if is_long else iterate
+    return x.T if tall else x
 
 
 class Muon(torch.optim.AdamW):

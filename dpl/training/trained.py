@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem import Load
-from dpl.models.interface import Base, HasCorrection
+from dpl.models.interface import Base, HasCorrection, Inputs
 from dpl.models.linear_base import SCALE_STREAM
 from dpl.scene import Scene
-from dpl.training.predictors import predictor_of
+from dpl.training.predictors import Fitted, OnLinearSolution, Predictor, Scaled
 
 
 class TrainedSurrogate(nn.Module):
@@ -28,7 +28,13 @@ class TrainedSurrogate(nn.Module):
     ) -> None:
         """Combine a network and a scene; the arguments are those of `Surrogate`."""
         super().__init__()
-        self.predictor, self.scene = predictor_of(net, scene, base, young=young), scene
+        Inputs.from_scene(scene, base, young=young)  # checks the options
+        predictor: Predictor = (
+            Fitted(net, scene)
+            if hasattr(net, "fit")
+            else (OnLinearSolution(net, scene) if base else Scaled(net, scene, young=young))
+        )
+        self.predictor, self.scene = predictor, scene
         largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
         self.register_buffer("largest_force", largest_force)
 

@@ -51,7 +51,7 @@ def surrogate(request, scene, batch):
     base = "linear" if is_linear else None
     module = Surrogate.from_network(NETWORKS[name], MSE(), scene, base=base)
     if module.predictor.lacks_bases:
-        module.fit_bases(batch)
+        module.predictor.fit_bases(batch)
     return module
 
 

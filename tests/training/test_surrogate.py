@@ -329,7 +329,7 @@ def test_the_checkpoint_of_another_scene_raises_an_error_with_both_fingerprints(
 
 def test_skipped_work_is_that_of_network_and_loss(scene):
     module = surrogate(scene, MSE())
-    assert module.skipped_work() == [*module.net.skipped_work(), *module.loss.skipped_work()]
+    assert module.skipped_work() == [*module.net.skipped_work(), *module.loss.saves]
     assert Surrogate(nn.Identity(), LrPlus(), scene).skipped_work() == []
     fitted = nn.Identity()
     fitted.fit = None

@@ -9,7 +9,18 @@ from dpl.system.checks import check_range
 from dpl.training.losses.loss import Loss, LossContext, clamp_scale, with_gradient
 
 
-class EnergyNormLoss(Loss):
+class _ScaledByStiffness(Loss):
+    """A loss over a strain energy of K(0), which is assembled once."""
+
+    def __init__(self, *, floor: float = 1e-2) -> None:
+        """Choose the floor, see `clamp_scale`."""
+        super().__init__()
+        check_range(0, 1, floor=floor)
+        self.floor = floor
+        self._rest: RestStiffness | None = None
+
+
+class EnergyNormLoss(_ScaledByStiffness):
     """Squared energy norm of the error, e^T K(0) e / v^T K(0) v with e = u - v.
 
     This is the squared relative error of strains. High-frequency errors are small in the MSE but
@@ -18,13 +29,6 @@ class EnergyNormLoss(Loss):
     """
 
     saves = ("no finite-element evaluation in training: K(0) is assembled once",)
-
-    def __init__(self, *, floor: float = 1e-2) -> None:
-        """Choose the floor, see `clamp_scale`."""
-        super().__init__()
-        check_range(0, 1, floor=floor)
-        self.floor = floor
-        self._rest: RestStiffness | None = None
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         self._rest = rest = RestStiffness.of(physics.problem, self._rest)
@@ -37,7 +41,7 @@ class EnergyNormLoss(Loss):
         return with_gradient(prediction, error / size, slope).mean()
 
 
-class PotentialEnergyLoss(Loss):
+class PotentialEnergyLoss(_ScaledByStiffness):
     """Total potential energy (W(u) - W(0) - f.u) / (f.K(0)^-1 f / 2), without reference solutions.
 
     Stable equilibria minimise the potential energy, so the displacements of the batch are not read.
@@ -56,13 +60,6 @@ class PotentialEnergyLoss(Loss):
     """
 
     saves = ("no displacement of the data set in the loss: it is the potential energy",)
-
-    def __init__(self, *, floor: float = 1e-2) -> None:
-        """Choose the floor, see `clamp_scale`."""
-        super().__init__()
-        check_range(0, 1, floor=floor)
-        self.floor = floor
-        self._rest: RestStiffness | None = None
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         self._rest = rest = RestStiffness.of(physics.problem, self._rest)

@@ -45,10 +45,6 @@ class Loss(L.Callback):
         """Log the terms."""
         module.log_dict({f"loss/{name}": term.detach() for name, term in self.terms.items()})
 
-    def skipped_work(self) -> list[str]:
-        """Return the work that this loss saves, one line each."""
-        return list(self.saves)
-
 
 class MSE(Loss):
     """Mean squared error of u/L over all degrees of freedom."""
@@ -73,7 +69,7 @@ class MSE(Loss):
 
     def errors(self, prediction: Tensor, batch: Sample) -> Tensor:
         """Return mean squared errors over powers of mean squared displacements, (B,)."""
-        error = squared_error(prediction, batch)
+        error = (prediction - batch.displacement).square().mean(dim=(1, 2))
         if not self.relative:
             return error
         size = batch.displacement.square().mean(dim=(1, 2))
@@ -108,6 +104,7 @@ class BlendedLoss(Loss):
         check_range(1, epochs=epochs)
         check_range(0, start=start)
         self.first, self.second = first, second
+        self.saves = tuple(line for line in first.saves if line in second.saves)
         self._epochs, self._start, self.weight = epochs, start, 0.0
 
     def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
@@ -129,14 +126,6 @@ class BlendedLoss(Loss):
                 self.terms |= {name: value}
                 self.terms |= {f"{name}/{term}": scalar for term, scalar in loss.terms.items()}
         return total
-
-    def skipped_work(self) -> list[str]:
-        return [line for line in self.first.skipped_work() if line in self.second.skipped_work()]
-
-
-def squared_error(prediction: Tensor, batch: Sample) -> Tensor:
-    """Return the mean square of (u - v)/L over degrees of freedom, (B,) [-]."""
-    return (prediction - batch.displacement).square().mean(dim=(1, 2))
 
 
 def clamp_scale(sizes: Tensor, floor: float) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 from dpl.fem.postprocess import tangent_product
 from dpl.scene import Sample
 from dpl.system.checks import check_range
-from dpl.training.losses.loss import MSE, Loss, LossContext, squared_error, with_gradient
+from dpl.training.losses.loss import MSE, Loss, LossContext, with_gradient
 
 MAX_RESIDUALS = 64  # samples whose residual norms are averaged
 
@@ -60,10 +60,10 @@ class LrPlus(Loss):
         """
         super().__init__()
         check_range(0, weight=weight)
-        self.weight = weight
+        self.error, self.weight = MSE(), weight
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
-        error = squared_error(prediction, batch).mean()
+        error = self.error(prediction, batch, physics)
         residual = residual_norm(prediction, batch, physics).mean()
         self.terms = {"error": error, "residual": residual}
         return error + self.weight * residual
