@@ -1,42 +1,15 @@
-"""The linear solution as the base of a prediction, and as the whitened input of a network."""
+"""Linear solutions of random loads, and their whitening for the input of a network."""
 
 import torch
 from torch import Tensor, nn
 
-from dpl.fem import Load
 from dpl.fem.rom.pod import pod
 from dpl.models.interface import full_precision
-from dpl.models.linear_response import LinearResponse
 from dpl.scene import Scene
 
 SCALE_STREAM = 3  # random stream of the loads for scales; samples use smaller numbers
 SCALE_LOADS = 256
 MODES = 128  # of a field that are whitened
-
-
-class LinearBase:
-    """Linear solutions of batches of loads, to which networks add.
-
-    Moved supports are part of the linear solution and keep their prescribed displacements.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        """Take the scene.
-
-        Raises:
-            ValueError: K(0) changes too much with the parameters, see `StiffnessTerms`.
-        """
-        self._problem = scene.problem
-        self._response = LinearResponse(scene, scene.linear.reference.symmetries)
-
-    def solve(self, load: Load) -> Tensor:
-        """Return linear solutions, (B, N, D) [-], float64, on the device of the load."""
-        force, parameters = self._response.dead_loads(load.force.double(), load.parameters)
-        free = self._problem.free.to(force.device)
-        values = self._response(force[:, free], parameters)
-        prescribed = self._problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
-        dofs = free.flatten().nonzero()[:, 0]
-        return prescribed.index_copy(1, dofs, values).view_as(force)
 
 
 def sampled_solutions(scene: Scene) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.nn.functional import pad
 
+from dpl.fem import Load
 from dpl.fem.linear.condensation import (
     Condensed,
     condense,
@@ -61,13 +62,14 @@ class LinearResponse:
     The blocks depend on the scene only and are computed when they are first used.
     """
 
-    def __init__(self, scene: Scene, group: SymmetryGroup) -> None:
-        """Take the scene and the symmetries of the body.
+    def __init__(self, scene: Scene, group: SymmetryGroup | None = None) -> None:
+        """Take the scene and symmetries of the body; None: all.
 
         Raises:
             ValueError: K(0) changes too much with the parameters, see `StiffnessTerms`.
         """
-        self.scene, self.group = scene, group
+        self.scene = scene
+        self.group = scene.linear.reference.symmetries if group is None else group
         self.terms.require_few_steps()
         self._kept: dict[tuple[torch.device, str], list[Any]] = {}
 
@@ -175,6 +177,19 @@ class LinearResponse:
         return solve
 
     # ------------------------------------------------------------------ batches
+
+    def solutions(self, load: Load) -> Tensor:
+        """Return linear solutions, (B, N, D) [-], float64, on the device of the load.
+
+        Moved supports are part of them and keep their prescribed displacements.
+        """
+        problem = self.scene.problem
+        force, parameters = self.dead_loads(load.force.double(), load.parameters)
+        free = problem.free.to(force.device)
+        values = self(force[:, free], parameters)
+        prescribed = problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
+        dofs = free.flatten().nonzero()[:, 0]
+        return prescribed.index_copy(1, dofs, values).view_as(force)
 
     def __call__(self, loaded: Tensor, parameters: Tensor) -> Tensor:
         """Return linear solutions (B, n) at free degrees of freedom of forces (B, n) on them.

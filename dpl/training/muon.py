@@ -86,9 +86,20 @@ class Muon(torch.optim.AdamW):
                 loss = closure()
         groups = self.param_groups
         for group in groups:
-            for parameter in group["params"]:
-                if parameter.ndim > 1 and parameter.grad is not None:
-                    self._update(parameter, parameter.grad, **group)
+            lr, momentum = group["lr"], group["momentum"]
+            for weights in group["params"]:
+                if weights.ndim < 2 or weights.grad is None:
+                    continue
+                state = self.state[weights]
+                if not state:
+                    state["momentum_buffer"] = torch.zeros_like(weights)
+                    state["step"] = torch.zeros(())  # Adam expects it in every restored state
+                mean = state["momentum_buffer"].lerp_(weights.grad, 1 - momentum)
+                update = weights.grad.lerp(mean, momentum).flatten(1)
+                update = orthogonal(update.bfloat16() if update.is_cuda else update)
+                weights.mul_(1 - lr * group["weight_decay"])
+                size = -0.2 * lr * math.sqrt(max(update.shape))
+                weights.add_(update.reshape(weights.shape), alpha=size)
         try:  # Adam updates the others
             self.param_groups = [
                 {**group, "params": [p for p in group["params"] if p.ndim < 2]} for group in groups
@@ -97,23 +108,3 @@ class Muon(torch.optim.AdamW):
         finally:
             self.param_groups = groups
         return loss
-
-    def _update(
-        self,
-        weights: Tensor,
-        gradient: Tensor,
-        *,
-        lr: float,
-        momentum: float,
-        weight_decay: float,
-        **_: Any,
-    ) -> None:
-        state = self.state[weights]
-        if not state:
-            state["momentum_buffer"] = torch.zeros_like(weights)
-            state["step"] = torch.zeros(())  # Adam expects it in every restored state
-        mean = state["momentum_buffer"].lerp_(gradient, 1 - momentum)
-        update = gradient.lerp(mean, momentum).flatten(1)
-        update = orthogonal(update.bfloat16() if update.is_cuda else update)
-        weights.mul_(1 - lr * weight_decay)
-        weights.add_(update.reshape(weights.shape), alpha=-0.2 * lr * math.sqrt(max(update.shape)))

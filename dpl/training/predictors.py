@@ -14,7 +14,8 @@ from dpl.data.samples import Samples
 from dpl.fem import Load, SubspaceNewton
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.models.interface import HasBases, HasCorrection, StoredBuffers
-from dpl.models.linear_base import FieldWhitening, LinearBase, sampled_solutions
+from dpl.models.linear_base import FieldWhitening, sampled_solutions
+from dpl.models.linear_response import LinearResponse
 from dpl.scene import Sample, Scene
 
 CHUNK = 256  # loads whose linear solutions are computed at a time
@@ -187,12 +188,12 @@ class OnLinearSolution(Predictor):
         """
         force, linear = sampled_solutions(scene)
         super().__init__(net, scene, *scales(scene, force, linear))
-        self.base = LinearBase(scene)
+        self.base = LinearResponse(scene)
         self.whiten = FieldWhitening(self.normalise(linear)[0], scene.problem.free)
 
     def forward(self, load: Load, linear: Tensor | None = None) -> Tensor:
         """Return displacements over L, (B, N, D), of loads; `linear`: the solutions if known."""
-        linear = self.base.solve(load) if linear is None else linear.to(load.force.dtype)
+        linear = self.base.solutions(load) if linear is None else linear.to(load.force.dtype)
         field, amplitude = self.normalise(linear)
         scalars = self.scalars(load, 2 * amplitude / (1 + amplitude) - 1)
         output = self.net(self.whiten(field.to(self.dtype)), scalars).to(linear.dtype)
@@ -244,7 +245,7 @@ class Fitted(Predictor):
 class LinearSamples(Samples):
     """Samples in memory with their linear solutions, and images of both under symmetries."""
 
-    def __init__(self, samples: Sample, base: LinearBase, group: SymmetryGroup) -> None:
+    def __init__(self, samples: Sample, base: LinearResponse, group: SymmetryGroup) -> None:
         """Compute the linear solutions of the samples, (S, N, D) [-], float32."""
         super().__init__(samples, group)
         self.linear = linear_solutions(samples.load, base)
@@ -258,10 +259,10 @@ class LinearSamples(Samples):
         return linear, super().__getitems__(indices)
 
 
-def linear_solutions(load: Load, base: LinearBase) -> Tensor:
+def linear_solutions(load: Load, base: LinearResponse) -> Tensor:
     """Return the linear solutions of many loads, (S, N, D) [-], float32, solved in chunks."""
     parts = zip(*(column.split(CHUNK) for column in load), strict=True)
-    return torch.cat([base.solve(Load(*part)).float() for part in parts])
+    return torch.cat([base.solutions(Load(*part)).float() for part in parts])
 
 
 def scales(scene: Scene, force: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,7 @@ from dpl.models.interface import Base, Inputs
 from dpl.scene import Sample, Scene
 from dpl.training import checkpoints
 from dpl.training.callbacks.averaged_weights import AveragedWeights
-from dpl.training.losses.loss import Loss, LossContext
+from dpl.training.losses import Loss, LossContext
 from dpl.training.metrics import ErrorMetrics
 from dpl.training.schedules import time_fraction, total_steps
 from dpl.training.trained import TrainedSurrogate

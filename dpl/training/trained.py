@@ -29,12 +29,14 @@ class TrainedSurrogate(nn.Module):
         """Combine a network and a scene; the arguments are those of `Surrogate`."""
         super().__init__()
         Inputs.from_scene(scene, base, young=young)  # checks the options
-        predictor: Predictor = (
-            Fitted(net, scene)
-            if hasattr(net, "fit")
-            else (OnLinearSolution(net, scene) if base else Scaled(net, scene, young=young))
-        )
-        self.predictor, self.scene = predictor, scene
+        self.scene = scene
+        self.predictor: Predictor
+        if hasattr(net, "fit"):
+            self.predictor = Fitted(net, scene)
+        elif base is None:
+            self.predictor = Scaled(net, scene, young=young)
+        else:
+            self.predictor = OnLinearSolution(net, scene)
         largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
         self.register_buffer("largest_force", largest_force)
 

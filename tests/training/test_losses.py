@@ -25,7 +25,7 @@ from dpl.training import (
     RMSELoss,
     Surrogate,
 )
-from dpl.training.losses.residual import residual_norm
+from dpl.training.losses import residual_norm
 
 LOSSES = sorted((Path(__file__).parents[2] / "conf" / "loss").glob("*.yaml"))
 

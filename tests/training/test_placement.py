@@ -156,7 +156,7 @@ class TestGPU:
         module = Surrogate.from_network(network, MSE(), scene, base="linear").to("cuda")
         force = batch.force.cuda().requires_grad_()
         load = Load(force, batch.young.cuda(), batch.parameters.cuda())
-        module.predictor.base.solve(load).sum().backward()
+        module.predictor.base.solutions(load).sum().backward()
         ones = torch.where(scene.problem.free, 1.0, 0.0).double()
         expected = LinearSolver(scene.problem).solve(ones)
         assert relative(force.grad[0], expected) < 1e-4
