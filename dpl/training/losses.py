@@ -26,7 +26,7 @@ class LossContext(NamedTuple):
     """The part of the scene that losses need, on the device of the batch."""
 
     problem: Problem  # without parameters; those of a batch are `batch.parameters`
-    largest_force: Tensor  # ||Phi q_max||, by which the paper divides residuals, () [-]
+    largest_force: float  # ||Phi q_max||, by which the paper divides residuals [-]
 
 
 class Loss(L.Callback):

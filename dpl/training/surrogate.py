@@ -59,7 +59,7 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         self.loss = loss
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
-        self.metrics = ErrorMetrics(scene.problem)
+        self.metrics, self._largest_force = ErrorMetrics(scene.problem), scene.loads.largest_force
 
     @classmethod
     def from_network(
@@ -79,7 +79,7 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
     @property
     def physics(self) -> LossContext:
         """The part of the scene that losses need, on the device of the network."""
-        return LossContext(self.predictor.problem, self.largest_force)
+        return LossContext(self.predictor.problem, self._largest_force)
 
     def describe(self) -> list[tuple[str, str]]:
         """Return name and size of the network, and the loss unless the model is fitted."""
@@ -92,8 +92,7 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
     def skipped_work(self) -> list[str]:
         """Return the work that network, loss and predictor save, one line each."""
         of_loss = () if self.predictor.is_closed_form else self.loss.saves
-        of_network = getattr(self.net, "skipped_work", list)()
-        return [*of_network, *of_loss, *self.predictor.saves]
+        return [*getattr(self.net, "skipped_work", list)(), *of_loss, *self.predictor.saves]
 
     def encode(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
         """Return the training set of samples and their images, see `Predictor.dataset`."""

@@ -21,8 +21,6 @@ class TrainedSurrogate(nn.Module):
     is the network with its scales, perhaps on the linear solution.
     """
 
-    largest_force: Tensor  # norm of the largest force of the loads, () [-]
-
     def __init__(
         self, net: nn.Module, scene: Scene, *, base: Base | None = None, young: bool = False
     ) -> None:
@@ -37,8 +35,6 @@ class TrainedSurrogate(nn.Module):
             self.predictor = Scaled(net, scene, young=young)
         else:
             self.predictor = OnLinearSolution(net, scene)
-        largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
-        self.register_buffer("largest_force", largest_force)
 
     @property
     def net(self) -> nn.Module:
@@ -79,10 +75,7 @@ class TrainedSurrogate(nn.Module):
                 raise ValueError(f"{name} of {stored.dtype} must be of {dtype}")
             if not stored.to(dtype).isfinite().all():
                 raise ValueError(f"{name} must be finite")
-        found = super().load_state_dict(state_dict, *args, **options)
-        if not self.largest_force > 0:
-            raise ValueError(f"largest_force = {float(self.largest_force)} must be above 0")
-        return found
+        return super().load_state_dict(state_dict, *args, **options)
 
     def check_predictions(self) -> None:
         """Raise ValueError if a prediction of a load of the scene is not finite."""

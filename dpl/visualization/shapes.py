@@ -118,8 +118,9 @@ class _Outlined:
         paint = np.concatenate([to_rgba_array(colours), lines])
         widths = np.repeat([0.3, 0.6], [len(self.polygons), len(self.sides)])
         shapes, widths = [shapes[k] for k in order], widths[order]
-        style: dict[str, Any] = {"edgecolors": "face", "linewidths": widths}
-        ax.add_collection(PolyCollection(shapes, facecolors=paint[order], **style))
+        colours, edges = paint[order], "face"
+        faces = PolyCollection(shapes, facecolors=colours, edgecolors=edges, linewidths=widths)
+        ax.add_collection(faces)
 
     def draw_lines(self, ax: Any, points: Array, colour: str, zorder: int) -> None:
         """Draw the feature edges of points (N, D)."""

@@ -174,7 +174,7 @@ def test_half_precision_products_change_a_prediction_by_their_rounding(name, bas
 
 def test_a_checkpoint_has_scales_and_weights_only(scene, batch):
     one, other = build("fcnn", scene), build("fcnn", scene, seed=1)
-    scales = {"largest_force", "predictor.force_scale", "predictor.displacement_scale"}
+    scales = {"predictor.force_scale", "predictor.displacement_scale"}
     weights = {f"predictor.net.{name}" for name, _ in one.net.named_parameters()}
     assert set(one.state_dict()) == scales | weights
     other.load_state_dict(one.state_dict())

@@ -38,7 +38,7 @@ def loss(request) -> Loss:
 
 @pytest.fixture(scope="module")
 def physics(scene):
-    return LossContext(scene.problem, torch.tensor(scene.loads.largest_force, dtype=torch.float64))
+    return LossContext(scene.problem, scene.loads.largest_force)
 
 
 @pytest.fixture(scope="module")

@@ -77,7 +77,6 @@ def test_problem_of_loss_and_metrics_follow_the_surrogate_and_return(scene):
             module.to_empty(device=device)
         for problem in (module.physics.problem, module.metrics.problem):
             assert problem.points.device.type == problem.free.device.type == device
-        assert module.physics.largest_force.device.type == device
     assert module.double().physics.problem is scene.problem, "no copy is made"
 
 
