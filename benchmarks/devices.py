@@ -176,7 +176,7 @@ def fitted(name: str, scene: Scene, samples: Sample) -> Surrogate:
     if name == FIT:
         cast(Unrolled, surrogate.net).fit(samples, samples)
     elif surrogate.predictor.lacks_bases:
-        surrogate.fit_bases(samples)
+        surrogate.predictor.fit_bases(samples)
     return surrogate
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from dpl.models.pod import PODNet
     from dpl.scene import Sample, Scene
     from dpl.system.files import DataSetError
-    from dpl.training.losses.loss import Loss
+    from dpl.training.losses import Loss
     from dpl.training.surrogate import Surrogate
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

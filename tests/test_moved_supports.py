@@ -70,13 +70,13 @@ def test_the_linear_solutions_of_scales_are_those_of_the_network(scene):
     young = force.new_ones(len(force))
     assert keeps_supports(scene, linear)
     assert torch.allclose(
-        surrogate.predictor.base.solve(Load(force, young)), linear, rtol=0, atol=1e-6
+        surrogate.predictor.base.solutions(Load(force, young)), linear, rtol=0, atol=1e-6
     )
 
 
 def test_linear_solutions_of_a_network_are_in_equilibrium(scene):
     body, load = scene.problem, scene.loads.sample(0, range(3))
-    linear = linear_network(scene).predictor.base.solve(load)
+    linear = linear_network(scene).predictor.base.solutions(load)
     assert keeps_supports(scene, linear)
     product = body.tangent_product(torch.zeros_like(linear), linear)
     residual = (product - load.force)[:, body.free].norm(dim=1)

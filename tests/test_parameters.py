@@ -320,7 +320,7 @@ def test_every_network_hears_poissons_ratio_and_a_batch_is_its_members(build, wi
     torch.manual_seed(0)
     module = Surrogate(build(wide), MSE(), wide).eval()
     if module.predictor.lacks_bases:
-        module.fit_bases(sets.samples("train"))
+        module.predictor.fit_bases(sets.samples("train"))
     low, high = by_poisson(module, member(few, 0))
     assert (low - high).norm() > 1e-4 * low.norm()
     with torch.no_grad():

@@ -14,7 +14,7 @@ from dpl.fem.assembly.follower_loads import NO_LOADS
 from dpl.fem.postprocess.energy import RestStiffness
 from dpl.inference import Simulator
 from dpl.models import FCNN, Unrolled
-from dpl.models.linear_base import LinearBase
+from dpl.models.linear_response import LinearResponse
 from dpl.training import MSE, PotentialEnergyLoss, Surrogate
 
 YOUNG = 2e4
@@ -121,7 +121,7 @@ def test_law_and_pressure_have_ranges_at_once():
     found = fem.solve(scene.solver, mixed).displacement
     own = fem.Newton(own_body("air", 100.0, poisson=0.25), tol=1e-10)
     assert_close(found, fem.solve(own, fem.Load(*mixed[:2])).displacement, rtol=0, atol=1e-12)
-    linear = LinearBase(scene).solve(mixed)[0]
+    linear = LinearResponse(scene).solutions(mixed)[0]
     exact = own.linear_solver.solve(mixed.force[0])
     assert (linear - exact).norm() < 1e-4 * exact.norm()
     field = torch.where(scene.problem.free, solution_like(scene), 0.0)[None]
@@ -168,7 +168,7 @@ def test_ranges_of_pressure_and_tension_keep_their_order():
 
 
 def test_the_linear_base_of_a_network_is_the_linear_solution(name, scene, load):
-    found = LinearBase(scene).solve(load)
+    found = LinearResponse(scene).solutions(load)
     bodies = [fem.LinearSolver(own_body(name, one.parameters)) for one in load.unbatch()]
     expected = torch.stack([own.solve(f) for own, f in zip(bodies, load.force, strict=True)])
     assert (found - expected).norm() < 1e-5 * expected.norm()
@@ -227,7 +227,7 @@ def net(scene):
 def test_unrolled_is_much_nearer_than_the_linear_solution(scene, net):
     net, other = net
     found = net(other.force, other.parameters) - other.displacement
-    linear = LinearBase(scene).solve(other.load) - other.displacement
+    linear = LinearResponse(scene).solutions(other.load) - other.displacement
     assert found.flatten(1).norm(dim=1).mean() < 0.03 * linear.flatten(1).norm(dim=1).mean()
 
 

@@ -74,7 +74,7 @@ EXPECTED_TYPES = {  # base classes of the object that the call under a key retur
     "loads": {"dpl.fem.loads.family.LoadFamily"},
     "data": {"dpl.data.dataset.DataSet", "dpl.data.datamodule.DataModule"},
     "model": {"torch.nn.modules.module.Module"},
-    "loss": {"dpl.training.losses.loss.Loss"},
+    "loss": {"dpl.training.losses.Loss"},
     "optimizer": {"torch.optim.optimizer.Optimizer"},
     "scheduler": {"torch.optim.lr_scheduler.LRScheduler"},
     "trainer": {"lightning.pytorch.trainer.trainer.Trainer"},
@@ -91,7 +91,7 @@ PARTS = {  # base classes of the objects that a call in the file of a run may co
     "dpl.fem.materials.fibres.energies.FibreEnergy",
     "dpl.fem.materials.fibres.reinforced.FibreDirections",
     "dpl.data.sources.Source",
-    "dpl.training.losses.loss.Loss",
+    "dpl.training.losses.Loss",
     "lightning.fabric.plugins.io.checkpoint_io.CheckpointIO",
     "numpy.ndarray",
 }

@@ -75,10 +75,9 @@ def _numbers(path: Path) -> list[float]:
         raise ValueError(f"{path} has no row {PREDICTION}; run evaluate.py run={path.parent}")
     prediction = rows[PREDICTION]
     latency = prediction["latency"].get(SIMULATOR, {}).get("p50", math.nan)
-    ratios = []
-    for tol in TOLS:
-        times = [rows.get(row(tol), {}).get("ms", math.nan) for row in (simulator_row, newton_row)]
-        ratios.append(times[0] / times[1])
+    times = {name: row.get("ms", math.nan) for name, row in rows.items()}
+    names = [(simulator_row(tol), newton_row(tol)) for tol in TOLS]
+    ratios = [times.get(ours, math.nan) / times.get(other, math.nan) for ours, other in names]
     return [*(prediction["errors"][name] for name in ERRORS), latency, *ratios]
 
 
@@ -106,10 +105,10 @@ def differing_options(
         column = [_short(value, MAX_VALUE) for value in values[key]]
         if column in found.values():
             continue
-        parts, others = key.split("."), [f".{other}" for other in differ if other != key]
+        parts = key.split(".")
         ends = (".".join(parts[start:]) for start in reversed(range(len(parts))))
-        unique = (end for end in ends if not any(o.endswith(f".{end}") for o in others))
-        name = next(unique, key)
+        counts = {end: sum(f".{one}".endswith(f".{end}") for one in differ) for end in ends}
+        name = next((end for end, count in counts.items() if count == 1), key)
         if (room := room - _width(name, *column)) < 0:
             break
         found[name] = column

@@ -15,21 +15,17 @@ def nodal_fields(
     "error [m]", the distance between both positions of a node.
     """
     newton = "N" if scene.problem.shape[1] == 3 else "N/m"
-    force = float(load.young) * scene.force_unit * load.force[0]
-    found = {f"force [{newton}]": force, **_of_displacement(scene, load, displacement)}
+    young, problem = float(load.young), scene.problem.with_parameters(load.parameters)
+    found = {f"force [{newton}]": young * scene.force_unit * load.force[0]}
+    for name, u in {"": displacement, "reference ": reference}.items():
+        if u is not None:
+            stress = fields(problem, u.double()[None])
+            found |= {
+                f"{name}displacement [m]": scene.length * u,
+                f"{name}Cauchy stress [Pa]": young * stress.stress[0],
+                f"{name}von Mises stress [Pa]": young * stress.von_mises[0],
+                f"{name}det F": stress.volume_ratio[0],
+            }
     if reference is not None:
-        known = _of_displacement(scene, load, reference)
-        found |= {f"reference {name}": field for name, field in known.items()}
         found["error [m]"] = scene.length * (displacement - reference).norm(dim=1)
     return found
-
-
-def _of_displacement(scene: Scene, load: Load, displacement: Tensor) -> dict[str, Tensor]:
-    young = float(load.young)
-    stress = fields(scene.problem.with_parameters(load.parameters), displacement.double()[None])
-    return {
-        "displacement [m]": scene.length * displacement,
-        "Cauchy stress [Pa]": young * stress.stress[0],
-        "von Mises stress [Pa]": young * stress.von_mises[0],
-        "det F": stress.volume_ratio[0],
-    }

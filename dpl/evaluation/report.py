@@ -99,11 +99,6 @@ def show(rows: Sequence[SolverResult], title: str) -> None:
     show_cells(title, columns, cells, space=1)
 
 
-def save(rows: Sequence[SolverResult], path: Path) -> None:
-    """Write rows as JSON."""
-    path.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
-
-
 def evaluate(
     surrogate: TrainedSurrogate,
     test: Sample,
@@ -162,7 +157,8 @@ def evaluate(
     about = "one at a time, 1 thread; median, worst and estimated error are relative L2"
     show(rows, f"{len(test.force)} test loads, {about}")
     print(f"latency, 1 thread: {'; '.join(f'{name} {one}' for name, one in latency.items())}")
-    save(rows, folder / "evaluation.json")
+    content = json.dumps([asdict(row) for row in rows], indent=1)
+    (folder / "evaluation.json").write_text(content + "\n")
     _draw(surrogate, test, displacements, folder)
     return rows
 

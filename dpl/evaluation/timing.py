@@ -77,18 +77,18 @@ def time_interleaved(
     Every solver is warmed up with the first load. Solvers are then timed alternately on each load,
     which cancels drifts of the CPU frequency; `tick` is called after each load.
     """
-    solutions: dict[K, list[Solution]] = {name: [] for name in solvers}
-    times: dict[K, list[float]] = {name: [] for name in solvers}
+    timed: dict[K, tuple[list[Solution], list[float]]] = {name: ([], []) for name in solvers}
     singles = load.unbatch()
     for solver in solvers.values():
         solve(solver, singles[0])
     for single in singles:
         for name, solver in solvers.items():
+            solutions, times = timed[name]
             start = time.perf_counter()
-            solutions[name].append(solve(solver, single))
-            times[name].append(1e3 * (time.perf_counter() - start))
+            solutions.append(solve(solver, single))
+            times.append(1e3 * (time.perf_counter() - start))
         tick()
     return {
-        name: (concatenate(solutions[name]), torch.tensor(times[name], dtype=torch.float64))
-        for name in solvers
+        name: (concatenate(solutions), torch.tensor(times, dtype=torch.float64))
+        for name, (solutions, times) in timed.items()
     }

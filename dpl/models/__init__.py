@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from dpl.models.fcnn import FCNN
     from dpl.models.gnn import GNN
     from dpl.models.interface import ClosedFormFit, HasBases, HasCorrection, Inputs
-    from dpl.models.linear_base import LinearBase
+    from dpl.models.linear_response import LinearResponse
     from dpl.models.pod import PODNet
     from dpl.models.unrolled.model import Unrolled
 else:

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import gelu
 
 from dpl.models.graph import Floats, Graph, Integers, hierarchy, means
-from dpl.models.interface import Inputs, StoredBuffers, check_indices
+from dpl.models.interface import Inputs
 from dpl.scene import Scene
 from dpl.system.checks import check_range
 from dpl.system.memory import refuse_weights
@@ -102,11 +102,10 @@ class GNN(nn.Module):
         return self.decode(states[0]).transpose(0, 1)
 
     def resultants(self, force: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the resultants of nodal forces (B, N, D) on the clusters of each level.
+        """Return the resultants of nodal forces f (B, N, D) on the clusters of each level.
 
-        Returns:
-            For each level, the sums of forces f over the nodes of a cluster, (K, B, D), and the
-            sums of first moments (x - centre) f^T, (K, B, D D) [-].
+        They are the sums of forces over the nodes of a cluster, (K, B, D), and the sums of first
+        moments (x - centre) f^T, (K, B, D D) [-].
         """
         force = force.transpose(0, 1).contiguous()
         moment = force.new_zeros(*force.shape[:2], force.shape[2] ** 2)
@@ -126,7 +125,7 @@ class GNN(nn.Module):
         return ["no absolute positions: the prediction is invariant under translations", line]
 
 
-class Level(StoredBuffers):
+class Level(nn.Module):
     """The graph of a level as tensors, and the encoder of its inputs."""
 
     receiver: Tensor
@@ -139,28 +138,22 @@ class Level(StoredBuffers):
     ) -> None:
         """Build the encoder of a graph of K members of a mesh with so many nodes.
 
-        Args:
-            graph, nodes, width: The graph, nodes of the mesh, and channels of the state.
-            flags: Fractions of free degrees of freedom and of boundary nodes, (K, D + 1).
-            first: Members are the nodes of the mesh.
-            averages: The input is a displacement, whose mean over a cluster has its scale, and not
-                a force, whose sum is the resultant.
+        `flags` are fractions of free degrees of freedom and of boundary nodes, (K, D + 1). Members
+        are the nodes of the mesh at the `first` level. If the input `averages`, it is a
+        displacement, whose mean over a cluster has its scale, and no force, which is summed.
         """
         super().__init__()
         count, dim = graph.points.shape
-        self.register_buffer("receiver", torch.from_numpy(graph.receiver))
-        self.register_buffer("sender", torch.from_numpy(graph.sender))
-        self.register_buffer("features", torch.from_numpy(graph.features()).float())
-        self.register_buffer("flags", torch.from_numpy(flags).float())
+        arrays = {"features": graph.features().astype("f4"), "flags": flags.astype("f4")}
+        arrays |= {"receiver": graph.receiver, "sender": graph.sender}
+        for name, array in arrays.items():
+            self.register_buffer(name, torch.from_numpy(array), persistent=False)
         self.complete, self.first, self.spacing = graph.complete, first, graph.spacing
         self.mean_degree = len(graph.sender) / count
         # of forces: geometric mean of the scales of a nodal force and of the sum over a cluster
         self.load_scale = count / nodes if averages else math.sqrt(count / nodes)
         self.load = nn.Linear(dim if first else dim + dim * dim, width, bias=False)
         self.place = nn.Sequential(nn.Linear(dim + 1, width), nn.GELU(), nn.Linear(width, width))
-
-    def check_buffers(self) -> None:
-        check_indices(len(self.flags), receiver=self.receiver, sender=self.sender)
 
     def forward(self, force: Tensor, moment: Tensor) -> Tensor:
         """Return the state (K, B, width) under forces (K, B, D) and moments (K, B, D D)."""
@@ -169,7 +162,7 @@ class Level(StoredBuffers):
         return self.load(force * self.load_scale) + self.place(self.flags)[:, None]
 
 
-class Step(StoredBuffers):
+class Step(nn.Module):
     """Map from the members of a level to the clusters of the next level."""
 
     cluster: Tensor
@@ -181,12 +174,9 @@ class Step(StoredBuffers):
         super().__init__()
         arm = fine.points - coarse.points[cluster]
         self.clusters, self.spacing = len(coarse.points), coarse.spacing
-        self.register_buffer("cluster", torch.from_numpy(cluster))
-        self.register_buffer("arm", torch.from_numpy(arm / coarse.spacing).float())
-        self.register_buffer("share", torch.from_numpy(1 / np.bincount(cluster)).float())
-
-    def check_buffers(self) -> None:
-        check_indices(self.clusters, cluster=self.cluster)
+        arm, share = (arm / coarse.spacing).astype("f4"), (1 / np.bincount(cluster)).astype("f4")
+        for name, array in {"cluster": cluster, "arm": arm, "share": share}.items():
+            self.register_buffer(name, torch.from_numpy(array), persistent=False)
 
     def sum(self, values: Tensor) -> Tensor:
         """Return the sums over members (K, B, ...) of each cluster."""

@@ -15,19 +15,12 @@ Floats = NDArray[np.float64]
 
 
 class Graph(NamedTuple):
-    """Symmetric directed graph of nodes or clusters.
+    """Symmetric directed graph of nodes or clusters."""
 
-    Attributes:
-        points: Positions, (K, D) [-].
-        receiver: Receiver of each edge, (P,), ascending.
-        sender: Sender of each edge, (P,).
-        complete: All pairs are edges, with loops.
-    """
-
-    points: Floats
-    receiver: Integers
-    sender: Integers
-    complete: bool
+    points: Floats  # positions, (K, D) [-]
+    receiver: Integers  # of each edge, (P,), ascending
+    sender: Integers  # of each edge, (P,)
+    complete: bool  # all pairs are edges, with loops
 
     @property
     def spacing(self) -> float:

@@ -1,49 +1,15 @@
-"""The linear solution as the base of a prediction, and as the whitened input of a network."""
-
-from functools import cached_property
+"""Linear solutions of random loads, and their whitening for the input of a network."""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from dpl.fem import Load
 from dpl.fem.rom.pod import pod
-from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.models.interface import full_precision
-from dpl.models.linear_response import LinearResponse
 from dpl.scene import Scene
 
 SCALE_STREAM = 3  # random stream of the loads for scales; samples use smaller numbers
 SCALE_LOADS = 256
 MODES = 128  # of a field that are whitened
-
-
-class LinearBase:
-    """Linear solutions of batches of loads, to which networks add.
-
-    Moved supports are part of the linear solution and keep their prescribed displacements.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        """Take the scene.
-
-        Raises:
-            ValueError: K(0) changes too much with the parameters, see `StiffnessTerms`.
-        """
-        self._scene, self._problem = scene, scene.problem
-        StiffnessTerms.of(scene.problem).require_few_steps()
-
-    @cached_property
-    def _response(self) -> LinearResponse:
-        return LinearResponse(self._scene, self._scene.linear.reference.symmetries)
-
-    def solve(self, load: Load) -> Tensor:
-        """Return linear solutions, (B, N, D) [-], float64, on the device of the load."""
-        force, parameters = self._response.dead_loads(load.force.double(), load.parameters)
-        free = self._problem.free.to(force.device)
-        values = self._response(force[:, free], parameters)
-        prescribed = self._problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
-        dofs = free.flatten().nonzero()[:, 0]
-        return prescribed.index_copy(1, dofs, values).view_as(force)
 
 
 def sampled_solutions(scene: Scene) -> tuple[Tensor, Tensor]:
@@ -65,7 +31,7 @@ def partial_whitening(size: Tensor) -> Tensor:
     return (size**0.6 * largest**0.4).clamp(min=1e-3 * float(largest))
 
 
-class FieldWhitening:
+class FieldWhitening(nn.Module):
     """Linear map of nodal fields that divides their POD coordinates by `partial_whitening`.
 
     A few bending modes dominate displacements. Gradient descent learns the influence of the other
@@ -77,8 +43,12 @@ class FieldWhitening:
     of equal variance).
     """
 
+    modes: Tensor
+    factors: Tensor
+
     def __init__(self, fields: Tensor, free: Tensor) -> None:
         """Compute the modes of fields (S, N, D), which count at `free` (N, D) only."""
+        super().__init__()
         columns = fields[:, free].double()
         vectors = pod(columns, min(MODES, *columns.shape)).vectors
         size = (columns @ vectors).square().mean(dim=0).sqrt()
@@ -90,14 +60,12 @@ class FieldWhitening:
         factors = factors / (square / len(vectors)).sqrt()  # the mean square of a result is one
         modes = vectors.new_zeros(len(factors), free.numel())
         modes[:, free.flatten()] = vectors.T
-        self._on_device = {modes.device: (modes.float(), factors.float())}
+        self.register_buffer("modes", modes.float(), persistent=False)
+        self.register_buffer("factors", factors.float(), persistent=False)
 
-    def __call__(self, field: Tensor) -> Tensor:
+    def forward(self, field: Tensor) -> Tensor:
         """Return whitened fields, (B, N, D), of fields (B, N, D) of any precision."""
-        if field.device not in self._on_device:
-            modes, factors = next(iter(self._on_device.values()))
-            self._on_device[field.device] = modes.to(field.device), factors.to(field.device)
-        modes, factors = (part.to(field.dtype) for part in self._on_device[field.device])
+        modes, factors = self.modes.to(field.dtype), self.factors.to(field.dtype)
         with full_precision(field.device.type):  # rounding errors would be amplified
             coordinates = field.flatten(1) @ modes.T
             amplified = (coordinates * (factors - factors[-1])) @ modes

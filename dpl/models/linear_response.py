@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.linalg import norm
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import Function
 from torch.nn.functional import pad
 
+from dpl.fem import Load
 from dpl.fem.linear.condensation import (
     Condensed,
     condense,
@@ -39,41 +39,12 @@ MAX_VALUES = 2**26  # of a batch that are computed at a time by tensor operation
 
 
 class OrbitArrays(NamedTuple):
-    """Degrees of freedom by parity p and symmetry g, see `dpl.fem.parity`.
+    """Degrees of freedom by parity p and symmetry g, see `dpl.fem.parity`."""
 
-    Attributes:
-        characters: Factor of parity p under symmetry g, (M, M).
-        dofs: Images of one degree of freedom of each of m orbits, (M, m).
-        signs: Factors of these images, (M, m).
-        scales: The same times the weights of the orbits, (M, m).
-    """
-
-    characters: Array
-    dofs: NDArray[np.int64]
-    signs: Array
-    scales: Array
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
-def split_force(orbits, force, support, parts):  # type: ignore[no-untyped-def]
-    """Set parts (M, m) to f - s over a unit by parity, and return this unit.
-
-    The unit is the largest entry, so that parts in float32 neither underflow nor overflow. The
-    force f is (N D,), the force of the supports s is given by parity, (M, m).
-    """
-    M, m = orbits.dofs.shape
-    whole, own = -support, np.empty(m)
-    for g in range(M):
-        for j in range(m):
-            own[j] = orbits.scales[g, j] * force[orbits.dofs[g, j]]
-        for p in range(M):
-            factor = orbits.characters[p, g]
-            for j in range(m):
-                whole[p, j] += factor * own[j]
-    unit = np.abs(whole).max()
-    unit = unit if unit > 0.0 else 1.0
-    parts[:] = whole / unit
-    return unit
+    characters: Array  # factor of parity p under symmetry g, (M, M)
+    dofs: NDArray[np.int64]  # images of one degree of freedom of each of m orbits, (M, m)
+    signs: Array  # factors of these images, (M, m)
+    scales: Array  # the same times the weights of the orbits, (M, m)
 
 
 class LinearResponse:
@@ -91,13 +62,14 @@ class LinearResponse:
     The blocks depend on the scene only and are computed when they are first used.
     """
 
-    def __init__(self, scene: Scene, group: SymmetryGroup) -> None:
-        """Take the scene and the symmetries of the body.
+    def __init__(self, scene: Scene, group: SymmetryGroup | None = None) -> None:
+        """Take the scene and symmetries of the body; None: all.
 
         Raises:
             ValueError: K(0) changes too much with the parameters, see `StiffnessTerms`.
         """
-        self.scene, self.group = scene, group
+        self.scene = scene
+        self.group = scene.linear.reference.symmetries if group is None else group
         self.terms.require_few_steps()
         self._kept: dict[tuple[torch.device, str], list[Any]] = {}
 
@@ -171,16 +143,18 @@ class LinearResponse:
 
         It returns a unit and, over this unit and by parity, f - s and K(0)^-1 (f - s), (M, m).
 
-        Args:
-            law: A law of the scene without ranges.
+        The law has no ranges. The unit is the largest entry, so that parts in float32 neither
+        underflow nor overflow.
         """
         factors = np.append(self.terms.factors(law)[0].numpy(), 1.0)
         inverse, orbits = self._inverse(factors), self.orbits
         support = (factors @ self._supports.numpy()).reshape(orbits.dofs.shape)
 
         def solve(force: Array) -> tuple[float, Parts, Parts]:
-            parts = np.empty(support.shape, self.blocks.values.dtype)
-            unit = split_force(orbits, force.reshape(-1), support, parts)
+            whole = orbits.characters @ (orbits.scales * force.ravel()[orbits.dofs]) - support
+            largest = float(np.abs(whole).max())
+            unit = largest if largest > 0 else 1.0
+            parts = (whole / unit).astype(self.blocks.values.dtype)
             return unit, parts, inverse(parts)
 
         return solve
@@ -204,12 +178,23 @@ class LinearResponse:
 
     # ------------------------------------------------------------------ batches
 
-    def __call__(self, loaded: Tensor, parameters: Tensor) -> Tensor:
-        """Return linear solutions at free degrees of freedom, (B, n).
+    def solutions(self, load: Load) -> Tensor:
+        """Return linear solutions, (B, N, D) [-], float64, on the device of the load.
 
-        Args:
-            loaded: Forces at free degrees of freedom, (B, n).
-            parameters: Parameters of the law, (B, P).
+        Moved supports are part of them and keep their prescribed displacements.
+        """
+        problem = self.scene.problem
+        force, parameters = self.dead_loads(load.force.double(), load.parameters)
+        free = problem.free.to(force.device)
+        values = self(force[:, free], parameters)
+        prescribed = problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
+        dofs = free.flatten().nonzero()[:, 0]
+        return prescribed.index_copy(1, dofs, values).view_as(force)
+
+    def __call__(self, loaded: Tensor, parameters: Tensor) -> Tensor:
+        """Return linear solutions (B, n) at free degrees of freedom of forces (B, n) on them.
+
+        The parameters, (B, P), are those of the law.
         """
         images, signs, scales, characters, supports, places = self._orbits(loaded.device)
         law = self.scene.problem.material.with_parameters(parameters)
@@ -226,11 +211,9 @@ class LinearResponse:
         return values.flatten(1)[:, places].to(loaded)
 
     def solve(self, right: Tensor, factors: Tensor) -> Tensor:
-        """Return K(0)^-1 f, (B, M m), without derivatives.
+        """Return K(0)^-1 f, (B, M m), of forces by parity, (B, M m), without derivatives.
 
-        Args:
-            right: Forces by parity, (B, M m), float64.
-            factors: Factors of the terms, and 1, (B, T + 1), float64.
+        The factors are those of the terms, and 1, (B, T + 1). All are float64.
         """
         many = right.shape[0] > FEW and not self.terms.varies  # which need no steps
         if right.device.type != "cpu" or many:
@@ -292,12 +275,10 @@ class LinearResponse:
 
     def _on(self, device: torch.device, name: str, make: Callable[[], list[Any]]) -> list[Any]:
         """Return tensors, kept for a device unless a graph is traced, whose tensors lack values."""
-        if (device, name) in self._kept:
-            return self._kept[device, name]
-        made = make()
+        found = self._kept.get((device, name)) or make()
         if not torch.compiler.is_compiling():
-            self._kept[device, name] = made
-        return made
+            self._kept[device, name] = found
+        return found
 
 
 class _Solve(Function):

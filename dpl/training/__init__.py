@@ -16,9 +16,17 @@ if TYPE_CHECKING:
     from dpl.training.callbacks.throughput import ThroughputMonitor, TrainingTime
     from dpl.training.callbacks.worst_cases import WorstCasePlots
     from dpl.training.closed_form import fit
-    from dpl.training.losses.energy import EnergyNormLoss, PotentialEnergyLoss
-    from dpl.training.losses.loss import MSE, BlendedLoss, Loss, LossContext, RMSELoss
-    from dpl.training.losses.residual import LrPlus, LrStar
+    from dpl.training.losses import (
+        MSE,
+        BlendedLoss,
+        EnergyNormLoss,
+        Loss,
+        LossContext,
+        LrPlus,
+        LrStar,
+        PotentialEnergyLoss,
+        RMSELoss,
+    )
     from dpl.training.metrics import ErrorMetrics, relative_errors
     from dpl.training.muon import Muon
     from dpl.training.predictors import Fitted, OnLinearSolution, Predictor, Scaled

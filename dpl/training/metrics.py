@@ -90,9 +90,8 @@ class ErrorMetrics(Metric):
 
 def errors_of(problem: Problem, prediction: Tensor, batch: Sample) -> dict[str, float]:
     """Return the metrics of displacements over L, (B, N, D), by name."""
-    metrics = ErrorMetrics(problem)
-    metrics.update(prediction, batch)
-    return {name: float(value) for name, value in metrics.compute().items()}
+    numbers = ErrorMetrics(problem)(prediction, batch)
+    return {name: float(value) for name, value in numbers.items()}
 
 
 def _norm(field: Tensor) -> Tensor:

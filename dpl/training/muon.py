@@ -27,25 +27,16 @@ def orthogonal(matrix: Tensor) -> Tensor:
     tall = matrix.size(0) > matrix.size(1)
     x = matrix.T if tall else matrix
     x = x / x.norm().clamp(min=1e-7)
-    if x.dtype == torch.float32 and x.size(1) >= LONG * x.size(0):
-        x = _polynomial(x @ x.T) @ x
-        return x.T if tall else x
-    for _ in range(ITERATIONS):
-        gram = x @ x.T
-        x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
-    return x.T if tall else x
-
-
-def _polynomial(gram: Tensor) -> Tensor:
-    """Return P, (n, n), of the last iterate P X, from X X^T, (n, n)."""
-    a, b, c = QUINTIC
-    eye = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
-    product = eye
-    for _ in range(ITERATIONS):
+    is_long = x.dtype == torch.float32 and x.size(1) >= LONG * x.size(0)
+    gram, eye = x @ x.T, torch.eye(len(x), dtype=x.dtype, device=x.device)
+    iterate = eye if is_long else x  # P or P X
+    for step in range(1, ITERATIONS + 1):
         factor = torch.addmm(gram, gram, gram, beta=b, alpha=c) + a * eye
-        product = factor @ product
-        gram = factor @ gram @ factor
-    return product
+        iterate = factor @ iterate
+        if step < ITERATIONS:
+            gram = factor @ gram @ factor if is_long else iterate @ iterate.T
+    x = iterate @ x if is_long else iterate
+    return x.T if tall else x
 
 
 class Muon(torch.optim.AdamW):
@@ -95,9 +86,20 @@ class Muon(torch.optim.AdamW):
                 loss = closure()
         groups = self.param_groups
         for group in groups:
-            for parameter in group["params"]:
-                if parameter.ndim > 1 and parameter.grad is not None:
-                    self._update(parameter, parameter.grad, **group)
+            lr, momentum = group["lr"], group["momentum"]
+            for weights in group["params"]:
+                if weights.ndim < 2 or weights.grad is None:
+                    continue
+                state = self.state[weights]
+                if not state:
+                    state["momentum_buffer"] = torch.zeros_like(weights)
+                    state["step"] = torch.zeros(())  # Adam expects it in every restored state
+                mean = state["momentum_buffer"].lerp_(weights.grad, 1 - momentum)
+                update = weights.grad.lerp(mean, momentum).flatten(1)
+                update = orthogonal(update.bfloat16() if update.is_cuda else update)
+                weights.mul_(1 - lr * group["weight_decay"])
+                size = -0.2 * lr * math.sqrt(max(update.shape))
+                weights.add_(update.reshape(weights.shape), alpha=size)
         try:  # Adam updates the others
             self.param_groups = [
                 {**group, "params": [p for p in group["params"] if p.ndim < 2]} for group in groups
@@ -106,23 +108,3 @@ class Muon(torch.optim.AdamW):
         finally:
             self.param_groups = groups
         return loss
-
-    def _update(
-        self,
-        weights: Tensor,
-        gradient: Tensor,
-        *,
-        lr: float,
-        momentum: float,
-        weight_decay: float,
-        **_: Any,
-    ) -> None:
-        state = self.state[weights]
-        if not state:
-            state["momentum_buffer"] = torch.zeros_like(weights)
-            state["step"] = torch.zeros(())  # Adam expects it in every restored state
-        mean = state["momentum_buffer"].lerp_(gradient, 1 - momentum)
-        update = gradient.lerp(mean, momentum).flatten(1)
-        update = orthogonal(update.bfloat16() if update.is_cuda else update)
-        weights.mul_(1 - lr * weight_decay)
-        weights.add_(update.reshape(weights.shape), alpha=-0.2 * lr * math.sqrt(max(update.shape)))

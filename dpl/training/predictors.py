@@ -4,7 +4,7 @@ A predictor is the only border between float64 mechanics and a float32 network.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -13,12 +13,10 @@ from torch.utils.data import Dataset
 from dpl.data.samples import Samples
 from dpl.fem import Load, SubspaceNewton
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
-from dpl.models.interface import Base, HasBases, HasCorrection, Inputs, StoredBuffers
-from dpl.models.linear_base import FieldWhitening, LinearBase, sampled_solutions
+from dpl.models.interface import HasBases, HasCorrection, StoredBuffers
+from dpl.models.linear_base import FieldWhitening, sampled_solutions
+from dpl.models.linear_response import LinearResponse
 from dpl.scene import Sample, Scene
-
-if TYPE_CHECKING:  # the losses import Lightning, which a loaded run does not need
-    from dpl.training.losses.loss import Loss
 
 CHUNK = 256  # loads whose linear solutions are computed at a time
 MAX_SNAPSHOTS = 4096  # samples and images from which a network computes its bases
@@ -96,15 +94,6 @@ class Predictor(StoredBuffers):
         """Return Newton's method in the modes of a network that `HasCorrection`, else None."""
         net = cast(HasCorrection, self.net)
         return net.correction() if hasattr(net, "correction") else None
-
-    def describe(self, loss: "Loss") -> str:
-        """Return name and size of the network, and the loss."""
-        count = sum(weights.numel() for weights in self.net.parameters())
-        return f"{type(self.net).__name__}, {count:,} weights; loss {type(loss).__name__}"
-
-    def skipped_work(self, loss: "Loss") -> list[str]:
-        """Return the work that network, loss and predictor save, one line each."""
-        return [*getattr(self.net, "skipped_work", list)(), *loss.skipped_work(), *self.saves]
 
     def check_buffers(self) -> None:
         """Raise ValueError if a scale is not positive."""
@@ -199,12 +188,12 @@ class OnLinearSolution(Predictor):
         """
         force, linear = sampled_solutions(scene)
         super().__init__(net, scene, *scales(scene, force, linear))
-        self.base = LinearBase(scene)
+        self.base = LinearResponse(scene)
         self.whiten = FieldWhitening(self.normalise(linear)[0], scene.problem.free)
 
     def forward(self, load: Load, linear: Tensor | None = None) -> Tensor:
         """Return displacements over L, (B, N, D), of loads; `linear`: the solutions if known."""
-        linear = self.base.solve(load) if linear is None else linear.to(load.force.dtype)
+        linear = self.base.solutions(load) if linear is None else linear.to(load.force.dtype)
         field, amplitude = self.normalise(linear)
         scalars = self.scalars(load, 2 * amplitude / (1 + amplitude) - 1)
         output = self.net(self.whiten(field.to(self.dtype)), scalars).to(linear.dtype)
@@ -252,19 +241,11 @@ class Fitted(Predictor):
         """Return displacements over L, (B, N, D) [-], float64."""
         return cast(Tensor, self.net(load.force, self.parameters_of(load)))
 
-    def describe(self, loss: "Loss") -> str:
-        """Return the name of the model."""
-        return f"{type(self.net).__name__}, fitted by linear regression"
-
-    def skipped_work(self, loss: "Loss") -> list[str]:
-        """Return the work that the model saves, one line each; the loss is not used."""
-        return list(getattr(self.net, "skipped_work", list)())
-
 
 class LinearSamples(Samples):
     """Samples in memory with their linear solutions, and images of both under symmetries."""
 
-    def __init__(self, samples: Sample, base: LinearBase, group: SymmetryGroup) -> None:
+    def __init__(self, samples: Sample, base: LinearResponse, group: SymmetryGroup) -> None:
         """Compute the linear solutions of the samples, (S, N, D) [-], float32."""
         super().__init__(samples, group)
         self.linear = linear_solutions(samples.load, base)
@@ -278,20 +259,10 @@ class LinearSamples(Samples):
         return linear, super().__getitems__(indices)
 
 
-def linear_solutions(load: Load, base: LinearBase) -> Tensor:
+def linear_solutions(load: Load, base: LinearResponse) -> Tensor:
     """Return the linear solutions of many loads, (S, N, D) [-], float32, solved in chunks."""
     parts = zip(*(column.split(CHUNK) for column in load), strict=True)
-    return torch.cat([base.solve(Load(*part)).float() for part in parts])
-
-
-def predictor_of(
-    net: nn.Module, scene: Scene, base: Base | None = None, *, young: bool = False
-) -> Predictor:
-    """Return the predictor of a network, or of a model that is fitted (it defines `fit`)."""
-    Inputs.from_scene(scene, base, young=young)  # checks the options
-    if hasattr(net, "fit"):
-        return Fitted(net, scene)
-    return Scaled(net, scene, young=young) if base is None else OnLinearSolution(net, scene)
+    return torch.cat([base.solutions(Load(*part)).float() for part in parts])
 
 
 def scales(scene: Scene, force: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,7 @@ from dpl.models.interface import Base, Inputs
 from dpl.scene import Sample, Scene
 from dpl.training import checkpoints
 from dpl.training.callbacks.averaged_weights import AveragedWeights
-from dpl.training.losses.loss import Loss, LossContext
+from dpl.training.losses import Loss, LossContext
 from dpl.training.metrics import ErrorMetrics
 from dpl.training.schedules import time_fraction, total_steps
 from dpl.training.trained import TrainedSurrogate
@@ -59,7 +59,7 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         self.loss = loss
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
-        self.metrics = ErrorMetrics(scene.problem)
+        self.metrics, self._largest_force = ErrorMetrics(scene.problem), scene.loads.largest_force
 
     @classmethod
     def from_network(
@@ -79,15 +79,20 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
     @property
     def physics(self) -> LossContext:
         """The part of the scene that losses need, on the device of the network."""
-        return LossContext(self.predictor.problem, self.largest_force)
+        return LossContext(self.predictor.problem, self._largest_force)
 
     def describe(self) -> list[tuple[str, str]]:
-        """Return name and size of the network, and the loss."""
-        return [("model", self.predictor.describe(self.loss))]
+        """Return name and size of the network, and the loss unless the model is fitted."""
+        name, loss = type(self.net).__name__, type(self.loss).__name__
+        if self.predictor.is_closed_form:
+            return [("model", f"{name}, fitted by linear regression")]
+        count = sum(weights.numel() for weights in self.net.parameters())
+        return [("model", f"{name}, {count:,} weights; loss {loss}")]
 
     def skipped_work(self) -> list[str]:
-        """Return the work that network and loss save, one line each."""
-        return self.predictor.skipped_work(self.loss)
+        """Return the work that network, loss and predictor save, one line each."""
+        of_loss = () if self.predictor.is_closed_form else self.loss.saves
+        return [*getattr(self.net, "skipped_work", list)(), *of_loss, *self.predictor.saves]
 
     def encode(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> Dataset:
         """Return the training set of samples and their images, see `Predictor.dataset`."""
@@ -109,32 +114,24 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
         self.log("loss/val", loss, batch_size=len(batch.force))
         self.metrics.update(prediction, batch)
 
-    def on_validation_epoch_end(self) -> None:
-        """Log the metrics as `val/NAME`."""
-        self._log_metrics("val")
-
     def test_step(self, batch: Sample, batch_idx: int) -> None:
         """Update the test metrics."""
         self.metrics.update(self.predict(batch.load), batch)
 
-    def on_test_epoch_end(self) -> None:
-        """Log the metrics as `test/NAME`."""
-        self._log_metrics("test")
-
-    def _log_metrics(self, part: str) -> None:
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics as `val/NAME`, those of a test as `test/NAME`."""
+        part = "test" if self.trainer.testing else "val"
         numbers = self.metrics.compute()  # those of all processes
         self.metrics.reset()
         self.log_dict({f"{part}/{name}": value for name, value in numbers.items()}, sync_dist=True)
+
+    on_test_epoch_end = on_validation_epoch_end
 
     def setup(self, stage: str) -> None:
         """Fit the bases of the network."""
         if stage == "fit" and self.predictor.lacks_bases:
             data = self.trainer.datamodule
-            self.fit_bases(data.snapshots(), data.group)
-
-    def fit_bases(self, samples: Sample, group: SymmetryGroup = NO_SYMMETRIES) -> None:
-        """Fit the bases of a network that `HasBases` to samples (S, N, D) and their images."""
-        self.predictor.fit_bases(samples, group)
+            self.predictor.fit_bases(data.snapshots(), data.group)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move the module, and the problem of the metrics to the same device.
@@ -183,9 +180,8 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the scene, the states of random number generators and averaged weights."""
-        checkpoint |= checkpoints.entries_of_scene(self.scene) | {
-            "random": checkpoints.random_states()
-        }
+        checkpoint |= checkpoints.entries_of_scene(self.scene)
+        checkpoint["random"] = checkpoints.random_states()
         # not a hook of the callback: Lightning calls those only for complete checkpoints
         for callback in self._trainer.callbacks if self._trainer else ():
             if isinstance(callback, AveragedWeights):

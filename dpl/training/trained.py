@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem import Load
-from dpl.models.interface import Base, HasCorrection
+from dpl.models.interface import Base, HasCorrection, Inputs
 from dpl.models.linear_base import SCALE_STREAM
 from dpl.scene import Scene
-from dpl.training.predictors import predictor_of
+from dpl.training.predictors import Fitted, OnLinearSolution, Predictor, Scaled
 
 
 class TrainedSurrogate(nn.Module):
@@ -21,16 +21,20 @@ class TrainedSurrogate(nn.Module):
     is the network with its scales, perhaps on the linear solution.
     """
 
-    largest_force: Tensor  # norm of the largest force of the loads, () [-]
-
     def __init__(
         self, net: nn.Module, scene: Scene, *, base: Base | None = None, young: bool = False
     ) -> None:
         """Combine a network and a scene; the arguments are those of `Surrogate`."""
         super().__init__()
-        self.predictor, self.scene = predictor_of(net, scene, base, young=young), scene
-        largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
-        self.register_buffer("largest_force", largest_force)
+        Inputs.from_scene(scene, base, young=young)  # checks the options
+        self.scene = scene
+        self.predictor: Predictor
+        if hasattr(net, "fit"):
+            self.predictor = Fitted(net, scene)
+        elif base is None:
+            self.predictor = Scaled(net, scene, young=young)
+        else:
+            self.predictor = OnLinearSolution(net, scene)
 
     @property
     def net(self) -> nn.Module:
@@ -71,10 +75,7 @@ class TrainedSurrogate(nn.Module):
                 raise ValueError(f"{name} of {stored.dtype} must be of {dtype}")
             if not stored.to(dtype).isfinite().all():
                 raise ValueError(f"{name} must be finite")
-        found = super().load_state_dict(state_dict, *args, **options)
-        if not self.largest_force > 0:
-            raise ValueError(f"largest_force = {float(self.largest_force)} must be above 0")
-        return found
+        return super().load_state_dict(state_dict, *args, **options)
 
     def check_predictions(self) -> None:
         """Raise ValueError if a prediction of a load of the scene is not finite."""

@@ -117,19 +117,17 @@ class _Outlined:
         lines = np.repeat(to_rgba_array(edges), len(self.sides), axis=0)
         paint = np.concatenate([to_rgba_array(colours), lines])
         widths = np.repeat([0.3, 0.6], [len(self.polygons), len(self.sides)])
-        style: dict[str, Any] = {
-            "facecolors": paint[order],
-            "edgecolors": "face",
-            "linewidths": widths[order],
-        }
-        ax.add_collection(PolyCollection([shapes[k] for k in order], **style))
+        shapes, widths = [shapes[k] for k in order], widths[order]
+        colours, edges = paint[order], "face"
+        faces = PolyCollection(shapes, facecolors=colours, edgecolors=edges, linewidths=widths)
+        ax.add_collection(faces)
 
     def draw_lines(self, ax: Any, points: Array, colour: str, zorder: int) -> None:
         """Draw the feature edges of points (N, D)."""
         from matplotlib.collections import LineCollection
 
-        style: dict[str, Any] = {"colors": colour, "linewidths": 0.7, "zorder": zorder}
-        ax.add_collection(LineCollection(list(project(points)[0][self.edges]), **style))
+        lines = list(project(points)[0][self.edges])
+        ax.add_collection(LineCollection(lines, colors=colour, linewidths=0.7, zorder=zorder))
 
 
 def project(points: Array) -> tuple[Array, Array]:

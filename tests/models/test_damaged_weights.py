@@ -40,7 +40,7 @@ def surrogate(request, scene, sets):
     if request.param == "unrolled":
         surrogate.net.fit(*sets[:2])
     elif request.param == "pod":
-        surrogate.fit_bases(sets[0])
+        surrogate.predictor.fit_bases(sets[0])
     return surrogate.eval()
 
 

@@ -9,8 +9,7 @@ from linear_solutions import BEAM, SUPPORTS, at_free, exact, relative
 from benchmarks.samples import solved
 from dpl import Scene, fem
 from dpl.fem import NeoHookeanLn
-from dpl.models import FCNN, LinearBase, Unrolled, linear_response
-from dpl.models.linear_response import LinearResponse
+from dpl.models import FCNN, LinearResponse, Unrolled, linear_response
 from dpl.training import RMSELoss, Surrogate
 
 REGIONS = {"core": fem.Box([1.0, 0.2, 0.2], [3.0, 0.8, 0.8])}
@@ -229,7 +228,7 @@ def test_networks_take_this_linear_solution_as_their_base():
     three = scene_of()
     load = three.loads.sample(0, range(4))
     expected = next(iter(three.linear.iterate(load))).displacement
-    assert relative(LinearBase(three).solve(load).flatten(1), expected.flatten(1)) < 1e-4
+    assert relative(LinearResponse(three).solutions(load).flatten(1), expected.flatten(1)) < 1e-4
     torch.manual_seed(0)
     loss, network = RMSELoss(relative=1.0, floor=0.0), partial(FCNN, width=16)
     surrogate = Surrogate.from_network(network, loss, three, base="linear")
@@ -243,6 +242,6 @@ def test_networks_take_this_linear_solution_as_their_base():
 def test_stiffnesses_that_differ_too_much_are_refused_before_any_training(other):
     laws = {"core": NeoHookeanLn(0.3, [1.0, 1e9]), "other": other}
     scene = scene_on(laws, REGIONS)
-    for build in (Unrolled, LinearBase):
+    for build in (Unrolled, LinearResponse):
         with pytest.raises(ValueError, match=r"core.young.* takes more than 200 steps.*base=null"):
             build(scene)

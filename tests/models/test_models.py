@@ -22,7 +22,7 @@ MODELS = [path for path in FILES if path.stem not in OTHERS]
 
 def with_bases(surrogate, samples):
     if surrogate.predictor.lacks_bases:
-        surrogate.fit_bases(samples)
+        surrogate.predictor.fit_bases(samples)
     return surrogate
 
 
@@ -78,7 +78,7 @@ def test_identical_samples_give_finite_outputs(build, scene, batch, kind):
     even = batch._replace(force=force, displacement=displacement, young=batch.young[:6])
     surrogate = Surrogate(build(), MSE(), scene)
     if hasattr(surrogate.net, "fit_bases"):
-        surrogate.fit_bases(even)
+        surrogate.predictor.fit_bases(even)
     optimizer = torch.optim.Adam(surrogate.parameters(), lr=1e-3)
     for _ in range(3):
         loss = surrogate.loss(surrogate.predict(even.load), even, surrogate.physics)
@@ -139,7 +139,7 @@ class OwnNet(torch.nn.Module):
 def test_bases_of_a_network_of_another_package_are_fitted_once(scene, batch):
     module = Surrogate(OwnNet(), MSE(), scene)
     assert module.predictor.lacks_bases
-    module.fit_bases(batch)
+    module.predictor.fit_bases(batch)
     assert not module.predictor.lacks_bases
     field, output = module.predictor.examples(batch)
     error = output - float(module.net.factor) * field

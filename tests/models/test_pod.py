@@ -25,7 +25,7 @@ def prepared(scene, samples, *, seed=0, base=None, group=NO_SYMMETRIES, **option
     torch.manual_seed(seed)
     network = partial(PODNet, **{**SMALL, **options})
     module = Surrogate.from_network(network, MSE(), scene, base=base)
-    module.fit_bases(samples, group)
+    module.predictor.fit_bases(samples, group)
     return module.eval()
 
 
@@ -219,7 +219,7 @@ def test_a_loaded_run_has_the_same_bases_and_predictions(trained, home, monkeypa
     assert alike(saved, dict(module.state_dict()))
     data = build.instantiate(cfg, "data", scene=module.scene)
     expected = build.build_surrogate(cfg, module.scene)
-    expected.fit_bases(data.samples("train"), fem.symmetries(module.scene.problem))
+    expected.predictor.fit_bases(data.samples("train"), fem.symmetries(module.scene.problem))
     assert alike(dict(expected.net.named_buffers()), dict(module.net.named_buffers()))
     test = data.samples("test")
     with torch.no_grad():
@@ -243,7 +243,7 @@ def test_a_stream_fits_the_bases_to_the_validation_loads(script, overrides, home
     assert isinstance(data.source, Stream)
     assert isinstance(module.predictor, OnLinearSolution)
     expected = build.build_surrogate(cfg, module.scene)
-    expected.fit_bases(data.samples("val"), fem.symmetries(module.scene.problem))
+    expected.predictor.fit_bases(data.samples("val"), fem.symmetries(module.scene.problem))
     assert alike(dict(expected.net.named_buffers()), dict(module.net.named_buffers()))
     weights = [dict(one.net.named_parameters()) for one in (expected, module)]
     assert not alike(*weights), "it has learnt"

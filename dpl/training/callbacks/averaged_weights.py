@@ -57,17 +57,19 @@ class AveragedWeights(L.Callback):
             for name, weight in self._weights.items():
                 self.average[name].lerp_(weight, 1 - decay)
 
+    @torch.no_grad()
     def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Put the average in the place of the weights."""
-        self._swap()
+        """Exchange the average and the weights of the module, before and after a validation."""
+        for name, average in self.average.items():
+            weight = self._weights[name].clone()
+            self._weights[name].copy_(average)
+            average.copy_(weight)
 
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Put the weights back."""
-        self._swap()
+    on_validation_end = on_validation_start
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Leave the average in the module."""
-        self._swap()
+        self.on_validation_start(trainer, pl_module)
         self.average, self._weights = {}, {}
 
     def state_dict(self) -> dict[str, Any]:
@@ -78,10 +80,3 @@ class AveragedWeights(L.Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the number of steps and, at the start of the training, the weights."""
         self.steps, self._restored = int(state_dict["steps"]), dict(state_dict["weights"])
-
-    @torch.no_grad()
-    def _swap(self) -> None:
-        for name, average in self.average.items():
-            weight = self._weights[name].clone()
-            self._weights[name].copy_(average)
-            average.copy_(weight)

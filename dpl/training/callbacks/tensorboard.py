@@ -1,7 +1,7 @@
 """Write the hyperparameters and the learning rate of a run for TensorBoard."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import lightning as L
@@ -72,10 +72,9 @@ class LogHyperparameters(L.Callback):
             return
         # the HPARAMS tab sorts its columns by name and shows the first ones
         named = {f"best/{name}": value for name, value in errors.items()}
-        for logger in trainer.loggers:
-            logger.log_metrics(named, step=last_step(trainer))
         _log_end(trainer, failed=False)
         for logger in trainer.loggers:
+            logger.log_metrics(named, step=last_step(trainer))
             logger.save()
             logger.finalize("success")
 
@@ -96,12 +95,10 @@ def _log_end(trainer: L.Trainer, *, failed: bool) -> None:
         writer._get_file_writer().add_summary(end)
 
 
-def tensorboard_writers(trainer: L.Trainer) -> Iterator[SummaryWriter]:
-    """Yield the TensorBoard writers of a trainer; none in any process but the first."""
-    if trainer.is_global_zero:
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                yield logger.experiment
+def tensorboard_writers(trainer: L.Trainer) -> list[SummaryWriter]:
+    """Return the TensorBoard writers of a trainer; none in any process but the first."""
+    loggers = trainer.loggers if trainer.is_global_zero else []
+    return [logger.experiment for logger in loggers if isinstance(logger, TensorBoardLogger)]
 
 
 def last_step(trainer: L.Trainer) -> int:

@@ -78,7 +78,7 @@ class WorstCasePlots(L.Callback):
         self._validations, self._next = state_dict["validations"], state_dict["next"]
 
     def _draw(self, trainer: L.Trainer, module: Any) -> None:
-        writers = list(tensorboard_writers(trainer))
+        writers = tensorboard_writers(trainer)
         if not writers or getattr(trainer, "datamodule", None) is None:
             return
         start = time.perf_counter()

@@ -1,1 +1,0 @@
-"""Losses of displacements: supervised, residual-based and energy-based."""
