@@ -6,7 +6,7 @@ from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
 from torch import Tensor
 
@@ -119,30 +119,24 @@ class Durations:
 class Request:
     """Tolerances and budget of a call."""
 
-    tol: float | None  # relative residual of the result [-]; None: not requested
-    budget_ms: float | None  # wall time of each load [ms]; None: no limit
-    error: float | None  # estimated relative error of the result [-]; None: not requested
-    warm: bool  # the last displacement is a guess too
-    begin: float = 0.0  # time at which the computation began [s]
-    products: int = PRODUCTS  # most products with the tangent in an estimated error
+    tol: float | None = None  # relative residual of the result [-]; None: not requested
+    budget_ms: float | None = None  # wall time of each load [ms]; None: no limit
+    error: float | None = None  # estimated relative error of the result [-]; None: not requested
     durations: Durations = field(default_factory=Durations)  # of this call and of earlier ones
+    warm: bool = False  # the last displacement is a guess too
+    products: int = PRODUCTS  # most products with the tangent in an estimated error
+    begin: float = field(default_factory=lambda: time.perf_counter())  # of the computation [s]
     spent: bool = False  # a computation ended because of the budget
 
-    @classmethod
-    def checked(
-        cls, tol: Any, budget_ms: Any, error: Any, durations: Durations, *, warm: bool
-    ) -> Self:
-        """Return the arguments of a call that begins, as numbers."""
-        begin = time.perf_counter()
-        tol, budget_ms = as_number("tol", tol), as_number("budget_ms", budget_ms)
-        error = as_number("error", error)
-        if tol is not None:
-            check_tol(tol)
-        if error is not None and not error > 0:
-            raise ValueError(f"error = {error} must be above 0")
-        if budget_ms is not None and not 0 < budget_ms < math.inf:
-            raise ValueError(f"budget_ms = {budget_ms} must be a number above 0")
-        return cls(tol, budget_ms, error, warm, begin, durations=durations)
+    def __post_init__(self) -> None:
+        self.tol, self.error = as_number("tol", self.tol), as_number("error", self.error)
+        self.budget_ms = as_number("budget_ms", self.budget_ms)
+        if self.tol is not None:
+            check_tol(self.tol)
+        if self.error is not None and not self.error > 0:
+            raise ValueError(f"error = {self.error} must be above 0")
+        if self.budget_ms is not None and not 0 < self.budget_ms < math.inf:
+            raise ValueError(f"budget_ms = {self.budget_ms} must be a number above 0")
 
     @property
     def sufficient_error(self) -> float:

@@ -48,6 +48,7 @@ class Simulator:
 
     Attributes:
         surrogate: The surrogate.
+        scene: Its scene.
         newton: Newton's method in the modes of the model; None: predictions are not corrected.
         steps: Largest number of its steps and of corrections of the whole together.
     """
@@ -68,6 +69,7 @@ class Simulator:
             raise ValueError(f"steps = {steps} must be 0 or more")
         newton = surrogate.predictor.correction() if newton is None else newton
         self.surrogate, self.newton, self.steps = surrogate.eval(), newton, steps
+        self.scene: Scene = surrogate.scene
         if newton is not None:
             newton.tangent  # noqa: B018  # built here, so that the first call is not slower
         self._before: tuple[Tensor, Tensor] | None = None  # parameters, displacement
@@ -75,11 +77,6 @@ class Simulator:
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
         self.scene.is_compact, self.scene.is_softened  # noqa: B018
         self.scene.linear.reference.corotational  # noqa: B018  # so is the factor of the estimate
-
-    @property
-    def scene(self) -> Scene:
-        """The scene of the surrogate."""
-        return self.surrogate.scene
 
     def __call__(
         self,
@@ -118,7 +115,7 @@ class Simulator:
             ValueError: An argument has a wrong shape, contains values that are no real numbers
                 (booleans, text, complex numbers, masked entries) or not finite, or is out of range.
         """
-        request = Request.checked(tol, budget_ms, error, self._durations, warm=warm)
+        request = Request(tol, budget_ms, error, self._durations, warm)
         given = as_numbers("force", force)
         load = as_load(self.scene, given, young, parameters)
         with one_thread(), torch.inference_mode():
@@ -148,7 +145,7 @@ class Simulator:
         `load` has B = 1. The prediction may contain steps in the modes.
         """
         (place,) = RangeCheck.of(self.surrogate, load)
-        request = Request(None, None, None, warm=False)
+        request = Request()
         request.products = self._products(place, request)
         with torch.inference_mode():
             (guess,) = self._guesses(load, [place])
@@ -250,7 +247,9 @@ class Simulator:
         with durations.timed("start"):
             if request.warm and self._before and torch.equal(self._before[0], load.parameters):
                 starts.append(Candidate.evaluated("last", problem, self._before[1], load, tol))
-            distances = [self._distance(load, one) for one in starts]
+            # a rough estimate suffices up to `FAR`
+            rough = Request(error=FAR, products=0 if self.scene.is_compact else MANY_PRODUCTS)
+            distances = [self._with_error(load, one, rough).known_error for one in starts]
         nearest = starts[distances.index(min(distances))]
         start = nearest.state.displacement if min(distances) <= FAR else None
         stage = "Newton" if start is None or not self.scene.is_compact else "iteration"
@@ -278,12 +277,6 @@ class Simulator:
             elif not state.converged:  # the initial state, which has been evaluated
                 continue
             yield Candidate("hybrid" if state.from_guess else "full Newton", state), stage
-
-    def _distance(self, load: Load, candidate: Candidate) -> float:
-        """Return the estimated relative error of a start [-]; one up to `FAR` may be rough."""
-        products = 0 if self.scene.is_compact else MANY_PRODUCTS
-        rough = Request(None, None, FAR, warm=False, products=products)
-        return self._with_error(load, candidate, rough).known_error
 
     def _predictions(self, load: Load, guess: Guess, request: Request) -> Iterator[Candidate]:
         """Yield the prediction after steps in the modes, then corrections of it where they help.

@@ -119,8 +119,17 @@ class Renderer:
         x, y = 0.22 / figure.get_figwidth(), (1 - 0.18 / 5.4, 1 - 0.58 / 5.4)
         figure.text(x, y[0], title, color=TEXT, size=18, weight="bold", va="top")
         figure.text(x, y[1], others, color=TEXT_GREY, size=12.24, va="top")
-        if top > 0:
-            _draw_legend(figure, frame.quantity, top)
+        if top > 0:  # the colour bar at the right edge
+            wide, high = figure.get_size_inches()
+            bar = figure.add_axes((1 - 0.92 / wide, 0.6 / high, 0.18 / wide, 1 - 1.8 / high))
+            unit, colours = QUANTITIES[frame.quantity], band_colours(frame.quantity) / 255
+            scale = ScalarMappable(Normalize(0, top), ListedColormap(colours))
+            labels = FuncFormatter(lambda value, _: engineering(value, unit))
+            ticks = np.linspace(0, top, 5).tolist()
+            figure.colorbar(scale, cax=bar, ticks=ticks, format=labels).outline.set_visible(False)
+            bar.tick_params(length=0, labelsize=10, labelcolor=TEXT_GREY)
+            place = 1 - 0.22 / wide, 1 - 0.98 / high
+            figure.text(*place, frame.quantity, color=TEXT, size=10, ha="right", va="center")
         canvas.draw()
         return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
@@ -165,16 +174,3 @@ class Renderer:
         brightness = 0.7 + 0.32 * np.abs(normals @ light) / np.linalg.norm(light)
         shades = np.clip(colours * brightness[:, None], 0, 255) / 255
         return soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1)
-
-
-def _draw_legend(figure: Figure, quantity: str, top: float) -> None:
-    """Draw the colour bar at the right edge."""
-    width, height = figure.get_size_inches()
-    bar = figure.add_axes((1 - 0.92 / width, 0.6 / height, 0.18 / width, 1 - 1.8 / height))
-    unit, colours = QUANTITIES[quantity], ListedColormap(band_colours(quantity) / 255)
-    scale, ticks = ScalarMappable(Normalize(0, top), colours), np.linspace(0, top, 5).tolist()
-    labels = FuncFormatter(lambda value, _: engineering(value, unit))
-    figure.colorbar(scale, cax=bar, ticks=ticks, format=labels).outline.set_visible(False)
-    bar.tick_params(length=0, labelsize=10, labelcolor=TEXT_GREY)
-    place = 1 - 0.22 / width, 1 - 0.98 / height
-    figure.text(*place, quantity, color=TEXT, size=10, ha="right", va="center")

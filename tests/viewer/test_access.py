@@ -445,9 +445,11 @@ def test_errors_of_functions_and_coroutines_are_reported(capfd):
     assert capfd.readouterr().err.splitlines() == [failures, failures], "no warning"
 
 
-def test_one_line_per_second_is_printed_and_others_are_counted(capfd):
+def test_one_line_per_second_is_printed_and_others_are_counted(capfd, monkeypatch):
     now = 5.0
-    complaints = RateLimitedHandler(lambda: now)
+    clock = SimpleNamespace(monotonic=lambda: now)
+    monkeypatch.setattr("dpl.viewer.access.time", clock)
+    complaints = RateLimitedHandler()
     lines = []
     for step in (0.0, 0.25, MIN_INTERVAL - 0.25 - 2**-20, 2**-20, 0.5, 3.0, 0.0):
         now += step
