@@ -6,11 +6,11 @@ from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import NamedTuple, Self, TypeVar
+from typing import NamedTuple, TypeVar
 
 from torch import Tensor
 
-from dpl.fem import Load, Problem, Solution, evaluate_solution
+from dpl.fem import Solution
 from dpl.fem.problem import Evaluation
 from dpl.fem.solvers.error_estimate import PRODUCTS
 from dpl.fem.solvers.solution import check_tol
@@ -46,26 +46,6 @@ class Candidate(NamedTuple):
     motion_error: float = 0.0  # largest distance of a held node from its prescribed place [-]
     force: Tensor | None = None  # of a gripper, (m,) [-]; None: balances the stresses
     forces_found: bool = False  # as of `GraspAnswer`
-
-    @classmethod
-    def evaluated(
-        cls,
-        method: str,
-        problem: Problem,
-        displacement: Tensor,
-        load: Load,
-        tol: float,
-        iterations: int = 0,
-        evaluation: Evaluation | None = None,
-    ) -> Self:
-        """Return a displacement as a solution, with its evaluation if that is not known."""
-        if evaluation is None:
-            evaluation = problem.with_parameters(load.parameters).evaluate(displacement)
-        state = evaluate_solution(
-            problem, displacement, load, tol, iterations=iterations,
-            from_guess=method in ("prediction", "corrected"), evaluation=evaluation,
-        )  # fmt: skip
-        return cls(method, state, evaluation=evaluation)
 
     @property
     def is_exact(self) -> bool:
@@ -148,11 +128,6 @@ class Request:
         """True if other methods may follow the prediction."""
         return (self.tol, self.budget_ms, self.error) != (None, None, None)
 
-    @property
-    def is_for_error(self) -> bool:
-        """True if the estimated error alone decides which solution is best."""
-        return self.tol is None and (self.error is not None or self.budget_ms is None)
-
     def residual_tol(self, scene: Scene) -> float:
         """Return the residual below which a solution counts as converged [-]."""
         return scene.solver.tol if self.tol is None else self.tol
@@ -178,7 +153,7 @@ class Request:
         The estimated error decides if it has a tolerance or nothing has, else the residual.
         """
         state = candidate.state
-        by_error = self.error is not None or self.is_for_error
+        by_error = self.error is not None or not self.is_more_than_prediction
         size = candidate.known_error if by_error else float(state.residual)
         valid = bool(state.volume_ratio > 0)
         return not bool(state.converged), not valid, size if size == size else math.inf

@@ -33,11 +33,6 @@ class Page:
     """Page with controls, readings and one or two bodies.
 
     Attributes:
-        body: The body.
-        worker: Thread that solves.
-        server: viser server.
-        placement: Places of the bodies and cameras that show them.
-        controls: Controls of the panel.
         recording: Recording of the shown frames, written to `folder`.
         frame: The most recent frame, if there is one.
         newton_frame: The most recent iterate of Newton for this request, if there is one.

@@ -56,26 +56,23 @@ def colour_bands(surface: Surface, frame: Frame, top: float) -> list[Floats]:
 def colour_top(values: Floats, before: float = 0.0) -> float:
     """Return the upper end of a colour scale that starts at 0 and contains values.
 
-    It is a rounded number, and stays as `before` unless the values are larger or far smaller.
-    Values that are not finite are ignored.
+    It is one of {1, 1.5, 2, 3, 4, 5, 6, 8} x 10^k, and stays as `before` unless the values are
+    larger or far smaller. Values that are not finite are ignored.
     """
     largest = float(values[np.isfinite(values)].max(initial=0.0))
-    return before if 0.4 * before <= largest <= before else round_up(largest)
+    if largest == 0:
+        return 0.0
+    if 0.4 * before <= largest <= before:
+        return before
+    power = 10.0 ** math.floor(math.log10(largest))
+    steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
+    return power * next((step for step in steps if largest <= step * power * (1 + 1e-9)), 10.0)
 
 
 def engineering(value: float, unit: str) -> str:
     """Return a value with three digits and its unit, such as "1.25 kN" for 1250 and "N"."""
     rounded = float(f"{value:.2e}")
     return EngFormatter(unit).format_data(rounded) if math.isfinite(value) else f"{value} {unit}"
-
-
-def round_up(number: float) -> float:
-    """Return the smallest number {1, 1.5, 2, 3, 4, 5, 6, 8} x 10^k that is not smaller."""
-    if not 0 < number < math.inf:
-        return 0.0
-    power = 10.0 ** math.floor(math.log10(number))
-    steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-    return power * next((step for step in steps if number <= step * power * (1 + 1e-9)), 10.0)
 
 
 @dataclass(frozen=True, eq=False)
