@@ -288,17 +288,14 @@ class Gripper:
     def _load(self, force: Any, young: Any, parameters: Any) -> Load:
         """Return the other forces on the body as a load, B = 1."""
         scene = self.scene
-        if force is not None:
-            given = as_numbers("force", force)
-            if given.ndim != 2:
-                raise ValueError(f"force: its shape is {tuple(given.shape)}; give one load (N, D)")
-            return as_load(scene, given, young, parameters)
-        rest = torch.zeros(scene.problem.shape, dtype=torch.float64)
-        load = as_load(scene, rest, young, parameters)
-        if (constant := scene.loads.constant_force) is None:
-            return load
-        modulus = scene.loads.moduli[0]  # by which the constant force is divided
-        return load._replace(force=constant[None] * (modulus / load.young))
+        if force is None:
+            constant, rest = scene.loads.constant_force, torch.zeros(scene.problem.shape)
+            unit = scene.loads.moduli[0] * scene.force_unit  # of the constant force
+            force = rest if constant is None else unit * constant
+        given = as_numbers("force", force)
+        if given.ndim != 2:
+            raise ValueError(f"force: its shape is {tuple(given.shape)}; give one load (N, D)")
+        return as_load(scene, given, young, parameters)
 
     def _motion(self, translation: Any, rotation: Any) -> tuple[Tensor, list[bool]]:
         """Return translation over L with rotation [rad], and the directions that are held."""

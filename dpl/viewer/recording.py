@@ -35,8 +35,7 @@ class Recording:
     def __init__(self, body: Body) -> None:
         """Create an empty recording, which adds no frames before `start`."""
         self.body, self.running = body, False
-        self.frames: list[tuple[float, Frame]] = []  # times from the first frame on [s]
-        self._begin = 0.0
+        self.frames: list[tuple[float, Frame]] = []  # with times on any clock [s]
 
     def start(self) -> None:
         """Remove all frames and start recording."""
@@ -45,8 +44,7 @@ class Recording:
     def add(self, frame: Frame, time: float) -> None:
         """Append a frame that is shown at a time [s]; ignored if stopped or full."""
         if self.running:
-            self._begin = self._begin if self.frames else time
-            self.frames.append((time - self._begin, frame))
+            self.frames.append((time, frame))
             self.running = len(self.frames) < MAX_FRAMES
 
     def save_series(self, folder: Path) -> Path:
@@ -58,7 +56,7 @@ class Recording:
             load = frame.load.dimensionless(scene)
             with torch.inference_mode():
                 fields = nodal_fields(scene, load, frame.displacement / scene.length)
-            files.append((time, f"{path.stem}/frame_{number:04d}.vtu"))
+            files.append((time - self.frames[0][0], f"{path.stem}/frame_{number:04d}.vtu"))
             arrays = {name: field.numpy() for name, field in fields.items()}
             write_mesh(folder / files[-1][1], scene.problem.mesh_in_metres, arrays)
         write_collection(path, files)
@@ -88,7 +86,7 @@ class Recording:
 def resample(frames: list[tuple[float, Frame]]) -> list[Frame]:
     """Return the frames shown at multiples of 1 / `FRAME_RATE`, of frames with times [s]."""
     times = np.array([time for time, _ in frames])
-    ticks = np.arange(0.0, times[-1] + 1 / FRAME_RATE, 1 / FRAME_RATE)
+    ticks = np.arange(times[0], times[-1] + 1 / FRAME_RATE, 1 / FRAME_RATE)
     chosen = np.clip(np.searchsorted(times, ticks + 1e-9) - 1, 0, None)
     return [frames[k][1] for k in chosen]
 

@@ -418,7 +418,8 @@ def test_an_invalid_value_of_a_control_prints_one_line(served, policy, failures,
 
 def test_an_error_in_a_callback_prints_one_line(served, policy, capfd, monkeypatch):
     now = 0.0
-    monkeypatch.setattr(policy.log, "_clock", lambda: now)
+    clock = SimpleNamespace(monotonic=lambda: now)
+    monkeypatch.setattr("dpl.viewer.access.time", clock)
     monkeypatch.setattr(served, "_submit", None)  # every call fails
     monkeypatch.setattr(served.worker, "submit", None)
     event = SimpleNamespace(client=object(), target=SimpleNamespace(value="VTU"))
