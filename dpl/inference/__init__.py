@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from dpl.inference.grasp import GraspAnswer, Gripper
     from dpl.inference.hybrid import (
         Corrected,
-        Corrector,
         Direct,
         Hybrid,
         default_hybrid,

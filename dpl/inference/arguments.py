@@ -16,14 +16,12 @@ from dpl.scene import Scene
 def as_numbers(name: str, value: Any) -> Tensor:
     """Return a copy of real numbers as a float64 tensor on the CPU."""
     refused = f"{name} must be real numbers"
-    if isinstance(value, Tensor):
-        if value.layout != torch.strided or value.is_meta or value.is_quantized:
-            raise ValueError(f"{refused}; this tensor has no dense values")
-        if value.is_complex() or value.dtype == torch.bool:
-            raise ValueError(f"{refused}, not {value.dtype}")
-        return value.detach().to("cpu", torch.float64, copy=True)
     try:
-        array = np.asarray(value)
+        given = value
+        if isinstance(value, Tensor):  # NumPy does not know all of its dtypes, such as bfloat16
+            given = value.detach().to("cpu", torch.float64 if value.is_floating_point() else None)
+            given = given.numpy()
+        array = np.asarray(given)
         real = array.dtype.kind in "iuf" or (
             array.dtype.kind == "O"
             and all(isinstance(x, Real) and not isinstance(x, bool) for x in array.flat)
@@ -83,11 +81,7 @@ def named_columns(name: str, value: Any, names: Sequence[str], count: int) -> Te
 def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
     """Return the arguments of a call, see `Simulator.__call__`, as a dimensionless load.
 
-    Args:
-        scene: The scene.
-        force: Nodal forces, (N, D) or (B, N, D) [N] (2D: [N/m]), float64.
-        young: Young's modulus, one number or (B,) [Pa]; None: that of the scene.
-        parameters: Values of the ranges of the body, see `named_columns`.
+    `force` has been converted by `as_numbers`, (N, D) or (B, N, D).
     """
     shape = scene.problem.shape
     if force.shape[-2:] != shape or force.ndim not in (2, 3) or not force.numel():

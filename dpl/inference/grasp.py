@@ -1,7 +1,6 @@
 """Grasps: the displacement of a patch is prescribed, its forces are found through a network."""
 
 import math
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import KW_ONLY, dataclass, field, replace
@@ -105,7 +104,7 @@ class Gripper:
     steps: int
     warm: bool = False
     sliding: bool = False
-    _patches: OrderedDict[bytes, RigidPatch] = field(default_factory=OrderedDict, repr=False)
+    _patches: dict[bytes, RigidPatch] = field(default_factory=dict, repr=False)
     _last: list[Grip] = field(default_factory=list, repr=False)  # at most one
     _durations: Durations = field(default_factory=Durations, repr=False)
 
@@ -155,18 +154,18 @@ class Gripper:
             ValueError: An argument has a wrong shape or is out of range, the patch has no node that
                 is free to move, or a patch that slides faces no axis.
         """
-        request = Request.checked(tol, budget_ms, None, self._durations, warm=self.warm)
+        request = Request(tol, budget_ms, None, self._durations, self.warm)
         load = self._load(force, young, parameters)
         motion, directions = self._motion(translation, rotation)
         patch = self.patch(region, directions, load.parameters)
         last = self._last.pop() if self._last else None
         with one_thread(), torch.inference_mode():
+            body = self._held(patch, motion, load, request)
             if not self._is_prepared(patch, request):
                 with self._durations.timed(FINISH):
-                    return self._at_rest(patch, motion, load, request)
+                    return self._reported(body, load, body.at_rest(), request)
             if last is not None and not (self.warm and last.patch is patch):
                 last = None
-            body = self._held(patch, motion, load, request)
             best: Candidate | None = None
             states = self._states(body, motion, load, last, request)
             for candidate in self._durations.each("state", states):
@@ -188,17 +187,6 @@ class Gripper:
                     )
                 return self._reported(body, load, best, request)
 
-    def _at_rest(
-        self, patch: RigidPatch, motion: Tensor, load: Load, request: Request
-    ) -> GraspAnswer:
-        """Return the body at rest as the answer of a patch that is not prepared."""
-        newton = self.scene.corrector.with_parameters(load.parameters)
-        goal = self._goal(patch, motion)
-        state = evaluate_solution(newton.problem, newton.problem.prescribed[None], load, newton.tol)
-        missed, force = float(patch.at(goal).norm(dim=1).max()), torch.zeros_like(goal)
-        best = Candidate("rest", state, math.inf, motion_error=missed, force=force)
-        return self._reported(HeldBody(patch, goal, load, newton), load, best, request)
-
     def _is_prepared(self, patch: RigidPatch, request: Request) -> bool:
         """Prepare a patch as far as the budget allows; return True if the call can go on."""
         while missing := patch.missing_rows:
@@ -209,14 +197,10 @@ class Gripper:
                 return False
         return True
 
-    def _goal(self, patch: RigidPatch, motion: Tensor) -> Tensor:
-        """Return the displacement of the held degrees of freedom, (m,) [-], of a motion."""
-        dim = patch.held.shape[1]
-        return patch.displacement(motion[:dim].tolist(), motion[dim:].tolist())
-
     def _held(self, patch: RigidPatch, motion: Tensor, load: Load, request: Request) -> HeldBody:
         """Return the body with a patch at a motion; its law has the parameters of the load."""
-        goal = self._goal(patch, motion)
+        dim = patch.held.shape[1]
+        goal = patch.displacement(motion[:dim].tolist(), motion[dim:].tolist())
         newton = patch.newton(self.scene.corrector, goal)
         newton = newton if request.tol is None else replace(newton, tol=request.tol)
         return HeldBody(patch, goal, Load(load.force, load.young), newton)
@@ -304,17 +288,14 @@ class Gripper:
     def _load(self, force: Any, young: Any, parameters: Any) -> Load:
         """Return the other forces on the body as a load, B = 1."""
         scene = self.scene
-        if force is not None:
-            given = as_numbers("force", force)
-            if given.ndim != 2:
-                raise ValueError(f"force: its shape is {tuple(given.shape)}; give one load (N, D)")
-            return as_load(scene, given, young, parameters)
-        rest = torch.zeros(scene.problem.shape, dtype=torch.float64)
-        load = as_load(scene, rest, young, parameters)
-        if (constant := scene.loads.constant_force) is None:
-            return load
-        modulus = scene.loads.moduli[0]  # by which the constant force is divided
-        return load._replace(force=constant[None] * (modulus / load.young))
+        if force is None:
+            constant, rest = scene.loads.constant_force, torch.zeros(scene.problem.shape)
+            unit = scene.loads.moduli[0] * scene.force_unit  # of the constant force
+            force = rest if constant is None else unit * constant
+        given = as_numbers("force", force)
+        if given.ndim != 2:
+            raise ValueError(f"force: its shape is {tuple(given.shape)}; give one load (N, D)")
+        return as_load(scene, given, young, parameters)
 
     def _motion(self, translation: Any, rotation: Any) -> tuple[Tensor, list[bool]]:
         """Return translation over L with rotation [rad], and the directions that are held."""
@@ -342,10 +323,9 @@ class Gripper:
         linear = self.scene.linear.with_parameters(parameters)
         patch = RigidPatch.of(linear, region, directions, sliding=self.sliding)
         key = patch.held.numpy().tobytes() + parameters.numpy().tobytes()
-        patch = self._patches.setdefault(key, patch)
-        self._patches.move_to_end(key)
+        patch = self._patches[key] = self._patches.pop(key, patch)  # the most recent is the last
         if len(self._patches) > MAX_PATCHES:
-            self._patches.popitem(last=False)
+            del self._patches[next(iter(self._patches))]
         return patch
 
     def _reported(

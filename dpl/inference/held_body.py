@@ -7,7 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dpl.fem import AndersonSolver, Load, Newton, RigidPatch, Solution, estimate_error
+from dpl.fem import (
+    AndersonSolver,
+    Load,
+    Newton,
+    RigidPatch,
+    Solution,
+    estimate_error,
+    evaluate_solution,
+)
 from dpl.fem.solvers.error_estimate import PRODUCTS
 from dpl.inference.hybrid import Hybrid
 from dpl.inference.request import Candidate, Request
@@ -29,6 +37,13 @@ class HeldBody:
     load: Load  # other forces on the body, B = 1, without parameters of the law
     newton: Newton  # with the patch as a moved support
 
+    def at_rest(self) -> Candidate:
+        """Return the body at rest, without a force of the gripper."""
+        problem, tol = self.patch.problem, self.newton.tol
+        state = evaluate_solution(problem, problem.prescribed[None], self.load, tol)
+        missed = float(self.patch.at(self.goal).norm(dim=1).max())
+        return Candidate("rest", state, math.inf, motion_error=missed, force=0 * self.goal)
+
     def predicted_forces(
         self,
         predict: Callable[[Tensor], Tensor],
@@ -41,8 +56,10 @@ class HeldBody:
     ) -> tuple[Tensor, Tensor, int, bool]:
         """Return forces of the gripper under which the predicted patch is displaced to the goal.
 
-        The result is the forces, (m,) [-], the displacement, (N, D) [-], the number of predictions,
-        and whether the gap between the predicted patch and the goal is below the tolerance.
+        `predict` gives a displacement (N, D) [-] under forces of the gripper (N, D) [-]. The
+        result is the forces, (m,) [-], the displacement, (N, D) [-], the number of predictions (at
+        least one), and whether the gap between the predicted patch and the goal is below `tol`
+        times the prescribed motion or `scale`, that without the gripper, whichever is larger.
 
         The forces are unknowns at all held degrees of freedom. Each iteration adds the forces that
         close the gap between predicted and prescribed displacement in the linear body; Anderson's
@@ -54,15 +71,6 @@ class HeldBody:
 
         Source: Anderson (1965), J. ACM 12; Walker, Ni (2011), SIAM J. Numer. Anal. 49 (as a least
         squares problem of differences).
-
-        Args:
-            predict: Function from the forces of the gripper (N, D) [-] to a displacement (N, D).
-            start: Forces to start from, (m,) [-].
-            scale: Size of the motion of the patch without the gripper [-]; errors are relative to
-                it or to the prescribed motion, whichever is larger.
-            tol: Relative error of the motion at which the iterations end [-].
-            max_iter: Largest number of predictions.
-            is_over: Returns True if no further prediction may be made; there is always one.
         """
         patch = self.patch
         size = max(scale, float(self.goal.abs().max()))

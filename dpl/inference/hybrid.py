@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -10,6 +9,7 @@ from torch import Tensor
 from dpl.fem import (
     AndersonSolver,
     Load,
+    Newton,
     Problem,
     Solution,
     SubspaceNewton,
@@ -21,24 +21,6 @@ from dpl.scene import Scene
 Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
 RULES = ("natural_monotonicity", "paper")
 SECOND_CORRECTION = 0.1  # norm, over that of the displacement, that is always allowed [-]
-
-
-class Corrector(Protocol):
-    """A Newton method that can start from a guess."""
-
-    @property
-    def problem(self) -> Problem:
-        """The body."""
-        ...
-
-    @property
-    def tol(self) -> float:
-        """Relative residual below which a solution counts as converged [-]."""
-        ...
-
-    def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
-        """Yield the initial state and the state after each iteration."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +92,7 @@ class Hybrid:
     """
 
     predict: Predict
-    newton: Corrector
+    newton: Newton
     rule: str = "natural_monotonicity"
     steps: AndersonSolver | None = None
     is_over: Callable[[], bool] = bool  # which returns False

@@ -6,11 +6,11 @@ from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import NamedTuple, TypeVar
 
 from torch import Tensor
 
-from dpl.fem import Load, Problem, Solution, evaluate_solution
+from dpl.fem import Solution
 from dpl.fem.problem import Evaluation
 from dpl.fem.solvers.error_estimate import PRODUCTS
 from dpl.fem.solvers.solution import check_tol
@@ -46,26 +46,6 @@ class Candidate(NamedTuple):
     motion_error: float = 0.0  # largest distance of a held node from its prescribed place [-]
     force: Tensor | None = None  # of a gripper, (m,) [-]; None: balances the stresses
     forces_found: bool = False  # as of `GraspAnswer`
-
-    @classmethod
-    def evaluated(
-        cls,
-        method: str,
-        problem: Problem,
-        displacement: Tensor,
-        load: Load,
-        tol: float,
-        iterations: int = 0,
-        evaluation: Evaluation | None = None,
-    ) -> Self:
-        """Return a displacement as a solution, with its evaluation if that is not known."""
-        if evaluation is None:
-            evaluation = problem.with_parameters(load.parameters).evaluate(displacement)
-        state = evaluate_solution(
-            problem, displacement, load, tol, iterations=iterations,
-            from_guess=method in ("prediction", "corrected"), evaluation=evaluation,
-        )  # fmt: skip
-        return cls(method, state, evaluation=evaluation)
 
     @property
     def is_exact(self) -> bool:
@@ -119,30 +99,24 @@ class Durations:
 class Request:
     """Tolerances and budget of a call."""
 
-    tol: float | None  # relative residual of the result [-]; None: not requested
-    budget_ms: float | None  # wall time of each load [ms]; None: no limit
-    error: float | None  # estimated relative error of the result [-]; None: not requested
-    warm: bool  # the last displacement is a guess too
-    begin: float = 0.0  # time at which the computation began [s]
-    products: int = PRODUCTS  # most products with the tangent in an estimated error
+    tol: float | None = None  # relative residual of the result [-]; None: not requested
+    budget_ms: float | None = None  # wall time of each load [ms]; None: no limit
+    error: float | None = None  # estimated relative error of the result [-]; None: not requested
     durations: Durations = field(default_factory=Durations)  # of this call and of earlier ones
+    warm: bool = False  # the last displacement is a guess too
+    products: int = PRODUCTS  # most products with the tangent in an estimated error
+    begin: float = field(default_factory=lambda: time.perf_counter())  # of the computation [s]
     spent: bool = False  # a computation ended because of the budget
 
-    @classmethod
-    def checked(
-        cls, tol: Any, budget_ms: Any, error: Any, durations: Durations, *, warm: bool
-    ) -> Self:
-        """Return the arguments of a call that begins, as numbers."""
-        begin = time.perf_counter()
-        tol, budget_ms = as_number("tol", tol), as_number("budget_ms", budget_ms)
-        error = as_number("error", error)
-        if tol is not None:
-            check_tol(tol)
-        if error is not None and not error > 0:
-            raise ValueError(f"error = {error} must be above 0")
-        if budget_ms is not None and not 0 < budget_ms < math.inf:
-            raise ValueError(f"budget_ms = {budget_ms} must be a number above 0")
-        return cls(tol, budget_ms, error, warm, begin, durations=durations)
+    def __post_init__(self) -> None:
+        self.tol, self.error = as_number("tol", self.tol), as_number("error", self.error)
+        self.budget_ms = as_number("budget_ms", self.budget_ms)
+        if self.tol is not None:
+            check_tol(self.tol)
+        if self.error is not None and not self.error > 0:
+            raise ValueError(f"error = {self.error} must be above 0")
+        if self.budget_ms is not None and not 0 < self.budget_ms < math.inf:
+            raise ValueError(f"budget_ms = {self.budget_ms} must be a number above 0")
 
     @property
     def sufficient_error(self) -> float:
@@ -153,11 +127,6 @@ class Request:
     def is_more_than_prediction(self) -> bool:
         """True if other methods may follow the prediction."""
         return (self.tol, self.budget_ms, self.error) != (None, None, None)
-
-    @property
-    def is_for_error(self) -> bool:
-        """True if the estimated error alone decides which solution is best."""
-        return self.tol is None and (self.error is not None or self.budget_ms is None)
 
     def residual_tol(self, scene: Scene) -> float:
         """Return the residual below which a solution counts as converged [-]."""
@@ -184,7 +153,7 @@ class Request:
         The estimated error decides if it has a tolerance or nothing has, else the residual.
         """
         state = candidate.state
-        by_error = self.error is not None or self.is_for_error
+        by_error = self.error is not None or not self.is_more_than_prediction
         size = candidate.known_error if by_error else float(state.residual)
         valid = bool(state.volume_ratio > 0)
         return not bool(state.converged), not valid, size if size == size else math.inf

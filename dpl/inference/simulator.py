@@ -12,12 +12,12 @@ from torch import Tensor
 
 from dpl.fem import (
     Load,
-    Solution,
     Status,
     SubspaceNewton,
     estimate_error,
     evaluate_solution,
 )
+from dpl.fem.problem import Evaluation
 from dpl.fem.solvers.error_estimate import MANY_PRODUCTS, PRODUCTS
 from dpl.inference.answer import Answer, RangeCheck, answer_of, stacked
 from dpl.inference.arguments import as_load, as_numbers
@@ -48,6 +48,7 @@ class Simulator:
 
     Attributes:
         surrogate: The surrogate.
+        scene: Its scene.
         newton: Newton's method in the modes of the model; None: predictions are not corrected.
         steps: Largest number of its steps and of corrections of the whole together.
     """
@@ -68,6 +69,7 @@ class Simulator:
             raise ValueError(f"steps = {steps} must be 0 or more")
         newton = surrogate.predictor.correction() if newton is None else newton
         self.surrogate, self.newton, self.steps = surrogate.eval(), newton, steps
+        self.scene: Scene = surrogate.scene
         if newton is not None:
             newton.tangent  # noqa: B018  # built here, so that the first call is not slower
         self._before: tuple[Tensor, Tensor] | None = None  # parameters, displacement
@@ -75,11 +77,6 @@ class Simulator:
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
         self.scene.is_compact, self.scene.is_softened  # noqa: B018
         self.scene.linear.reference.corotational  # noqa: B018  # so is the factor of the estimate
-
-    @property
-    def scene(self) -> Scene:
-        """The scene of the surrogate."""
-        return self.surrogate.scene
 
     def __call__(
         self,
@@ -113,12 +110,8 @@ class Simulator:
             warm: Start from the last displacement if it is nearer to equilibrium than the
                 prediction.
             stability: Factorise the tangent at the result to determine its stability.
-
-        Raises:
-            ValueError: An argument has a wrong shape, contains values that are no real numbers
-                (booleans, text, complex numbers, masked entries) or not finite, or is out of range.
         """
-        request = Request.checked(tol, budget_ms, error, self._durations, warm=warm)
+        request = Request(tol, budget_ms, error, self._durations, warm)
         given = as_numbers("force", force)
         load = as_load(self.scene, given, young, parameters)
         with one_thread(), torch.inference_mode():
@@ -132,9 +125,16 @@ class Simulator:
                 best = self._solve(single, guess, place, own)
                 with own.durations.timed(FINISH):
                     best = self._with_error(single, best, own)
-                    if stability:
-                        best = best._replace(state=self._with_stability(single, best.state))
-                    self._before = single.parameters, best.state.displacement
+                    state = best.state
+                    if stability and state.converged and int(state.negative_pivots) < 0:
+                        newton = self.scene.newton.with_parameters(single.parameters)
+                        pivots = newton.stability(state.displacement)
+                        status = int(Status.UNSTABLE if pivots > 0 else Status.CONVERGED)
+                        counted = state._replace(
+                            negative_pivots=torch.tensor([pivots]), status=torch.tensor([status])
+                        )
+                        best = best._replace(state=counted)
+                    self._before = single.parameters, state.displacement
                     answers.append(answer_of(best, place, own, self.scene))
         numpy = not isinstance(force, Tensor)
         if given.ndim == 3:
@@ -148,7 +148,7 @@ class Simulator:
         `load` has B = 1. The prediction may contain steps in the modes.
         """
         (place,) = RangeCheck.of(self.surrogate, load)
-        request = Request(None, None, None, warm=False)
+        request = Request()
         request.products = self._products(place, request)
         with torch.inference_mode():
             (guess,) = self._guesses(load, [place])
@@ -241,7 +241,6 @@ class Simulator:
         is near equilibrium. Otherwise Newton's method starts from rest, since its iterates from far
         seldom lead to a solution.
         """
-        problem, tol = self.scene.problem, request.iteration_tol(self.scene)
         for first in self._predictions(load, guess, request):
             yield first, "start"  # the last one is the best
         if not request.is_more_than_prediction:
@@ -249,14 +248,16 @@ class Simulator:
         starts, durations = [first], request.durations
         with durations.timed("start"):
             if request.warm and self._before and torch.equal(self._before[0], load.parameters):
-                starts.append(Candidate.evaluated("last", problem, self._before[1], load, tol))
-            distances = [self._distance(load, one) for one in starts]
+                starts.append(self._evaluated("last", self._before[1], load, request))
+            # a rough estimate suffices up to `FAR`
+            rough = Request(error=FAR, products=0 if self.scene.is_compact else MANY_PRODUCTS)
+            distances = [self._with_error(load, one, rough).known_error for one in starts]
         nearest = starts[distances.index(min(distances))]
         start = nearest.state.displacement if min(distances) <= FAR else None
         stage = "Newton" if start is None or not self.scene.is_compact else "iteration"
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
             linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
-            yield Candidate.evaluated("linear", problem, linear, load, tol), stage
+            yield self._evaluated("linear", linear, load, request), stage
         elif request.over(stage):
             return
 
@@ -265,6 +266,7 @@ class Simulator:
             stage = "Newton"
             return request.over(stage)
 
+        tol = request.iteration_tol(self.scene)
         states = replace(self.scene.corrector, tol=tol).iterate(load)
         if start is not None:
             hybrid = default_hybrid(lambda load: start, self.scene, tol)
@@ -279,12 +281,6 @@ class Simulator:
                 continue
             yield Candidate("hybrid" if state.from_guess else "full Newton", state), stage
 
-    def _distance(self, load: Load, candidate: Candidate) -> float:
-        """Return the estimated relative error of a start [-]; one up to `FAR` may be rough."""
-        products = 0 if self.scene.is_compact else MANY_PRODUCTS
-        rough = Request(None, None, FAR, warm=False, products=products)
-        return self._with_error(load, candidate, rough).known_error
-
     def _predictions(self, load: Load, guess: Guess, request: Request) -> Iterator[Candidate]:
         """Yield the prediction after steps in the modes, then corrections of it where they help.
 
@@ -293,10 +289,11 @@ class Simulator:
         estimated error is too large and decreases.
         """
         last = self._in_modes(load, guess, request)
-        if request.error is not None or (self.newton is not None and request.is_for_error):
+        is_corrected = self.newton is not None
+        if request.error is not None or (is_corrected and not request.is_more_than_prediction):
             last = self._with_error(load, last, request)
         yield last
-        if self.newton is None:
+        if not is_corrected:
             return
         while last.correction is not None and last.known_error > request.sufficient_error:
             taken = int(last.state.iterations) + 1
@@ -316,12 +313,9 @@ class Simulator:
 
         No step is made where the known error is sufficient, or if none is left.
         """
-        problem, tol = self.scene.problem, request.iteration_tol(self.scene)
-        if self.newton is None:
-            return Candidate.evaluated("prediction", problem, guess.displacement, load, tol)
         method = "corrected" if taken else "prediction"
-        first = Candidate.evaluated(method, problem, guess.displacement, load, tol, taken)
-        if not first.state.residual.isfinite():
+        first = self._evaluated(method, guess.displacement, load, request, taken)
+        if self.newton is None or not first.state.residual.isfinite():
             return first
         in_range = bool((first.state.volume_ratio > 0) & (first.state.residual < MAX_RESIDUAL))
         enough = request.sufficient_error if taken < self.steps else FAR
@@ -335,19 +329,26 @@ class Simulator:
         )  # fmt: skip
         request.durations.add("step", (time.perf_counter() - begin) / (1 + state.iterations))
         if state.iterations:
-            iterations = taken + state.iterations
-            evaluation = state.evaluation
-            first = Candidate.evaluated(
-                "corrected", problem, state.displacement, load, tol, iterations, evaluation
-            )
+            u, taken = state.displacement, taken + state.iterations
+            first = self._evaluated("corrected", u, load, request, taken, state.evaluation)
         outside = guess.error_outside if first.state.residual < MAX_RESIDUAL else math.inf
         return first._replace(error_in_modes=state.error, error_outside=outside)
 
-    def _with_stability(self, load: Load, state: Solution) -> Solution:
-        """Return a solution with the number of negative eigenvalues of its tangent."""
-        if not state.converged or int(state.negative_pivots) >= 0:
-            return state
-        newton = self.scene.newton.with_parameters(load.parameters)
-        pivots = newton.stability(state.displacement)
-        status = int(Status.UNSTABLE if pivots > 0 else Status.CONVERGED)
-        return state._replace(negative_pivots=torch.tensor([pivots]), status=torch.tensor([status]))
+    def _evaluated(
+        self,
+        method: str,
+        displacement: Tensor,
+        load: Load,
+        request: Request,
+        iterations: int = 0,
+        evaluation: Evaluation | None = None,
+    ) -> Candidate:
+        """Return a displacement as a solution, with its evaluation if that is not known."""
+        problem, tol = self.scene.problem, request.iteration_tol(self.scene)
+        if evaluation is None:
+            evaluation = problem.with_parameters(load.parameters).evaluate(displacement)
+        state = evaluate_solution(
+            problem, displacement, load, tol, iterations=iterations,
+            from_guess=method in ("prediction", "corrected"), evaluation=evaluation,
+        )  # fmt: skip
+        return Candidate(method, state, evaluation=evaluation)

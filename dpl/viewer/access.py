@@ -54,21 +54,19 @@ class RateLimitedHandler(logging.Handler):
     control characters. `logger` has this handler only.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Create the handler and its logger; `clock` returns the time [s]."""
+    def __init__(self) -> None:
+        """Create the handler and its logger."""
         super().__init__(logging.ERROR)
         self.logger = logging.Logger("dpl.viewer", logging.ERROR)
         self.logger.addHandler(self)
-        self._clock = clock
-        self._last_line = -math.inf
-        self._n_omitted = 0
+        self._last_line, self._n_omitted = -math.inf, 0
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a record and its exception in one line, or count it if the last is too recent.
 
         `logging.Handler.handle` calls this method under a lock.
         """
-        now = self._clock()
+        now = time.monotonic()
         if now - self._last_line < MIN_INTERVAL:
             self._n_omitted += 1
             return

@@ -43,10 +43,7 @@ class Controls:
     """Widgets of the panel.
 
     Attributes:
-        mode: Mode of a drag, `PULL` or `GRASP`.
         radii: Sliders of the radius of the patch over L, by mode; `radius` is the selected value.
-        direction, amplitude: The patch load, visible in the mode `PULL`.
-        axis, angle, sliding: Motion of the patch, visible in the mode `GRASP`; in 2D without axis.
         young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
         parameters: Sliders of the ranges of law and follower loads, by name.
         readings, details: HTML of the result; `state` is that of the recording.

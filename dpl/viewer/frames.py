@@ -41,7 +41,6 @@ class Frame(NamedTuple):
     """A displacement and the values that are shown."""
 
     request: LoadRequest
-    load: LoadRequest  # on the body; of a grasp, with the forces of the gripper
     displacement: Tensor  # (N, D) [m]
     points: Floats  # deformed surface over L, (S, 3) [-]
     values: Floats  # of the quantity on the surface, (S,), in its unit
@@ -53,14 +52,16 @@ class Frame(NamedTuple):
         """Result of a grasp; None for that of a load or an iterate of Newton."""
         return self.answer if isinstance(self.answer, GraspAnswer) else None
 
+    @property
+    def load(self) -> LoadRequest:
+        """Load on the body in an answer of the simulator, with the forces of a gripper."""
+        return self.request.load(self.answer)
+
 
 class Body:
     """A simulator and the surface of its body.
 
     Attributes:
-        simulator: The simulator.
-        scene: Its scene.
-        surface: Surface of the body.
         young: Default Young's modulus, the middle of the training range [Pa].
         parameters: Default parameters of the law by name, alike.
         patch: Function from node and radius to a `Patch`. It caches the last one, which takes
@@ -127,7 +128,7 @@ class Body:
                 )
             reference = torch.as_tensor(exact.displacement)
         u = torch.as_tensor(answer.displacement)
-        return self._frame(request, request.load(answer), u, settings.quantity, answer, reference)
+        return self._frame(request, u, settings.quantity, answer, reference)
 
     def newton_frames(
         self, request: LoadRequest, settings: ViewSettings, reference: Frame
@@ -137,12 +138,11 @@ class Body:
         with one_thread():
             for state in request.newton_states(self.scene):
                 u = self.scene.length * state.displacement[0]
-                yield self._frame(request, reference.load, u, settings.quantity, state, exact)
+                yield self._frame(request, u, settings.quantity, state, exact)
 
     def _frame(
         self,
         request: LoadRequest,
-        load: LoadRequest,
         displacement: Tensor,
         quantity: str,
         answer: Any,
@@ -153,11 +153,9 @@ class Body:
         values = (displacement - reference).norm(dim=1).numpy()[surface.nodes]
         if quantity == STRESS and bool(displacement.any()):  # at rest it is zero up to rounding
             with torch.inference_mode():
-                stress = surface.von_mises(u, load.dimensionless(self.scene).parameters)
-            values = load.young * stress
-        return Frame(
-            request, load, displacement, surface.deformed_points(u), values, quantity, answer
-        )
+                stress = surface.von_mises(u, request.dimensionless(self.scene).parameters)
+            values = request.young * stress
+        return Frame(request, displacement, surface.deformed_points(u), values, quantity, answer)
 
     def arrow_ends(self, frame: Frame) -> Floats:
         """Return start and end of the arrow over L, (2, 3); (0, 3) if the total force is zero.

@@ -33,11 +33,6 @@ class Page:
     """Page with controls, readings and one or two bodies.
 
     Attributes:
-        body: The body.
-        worker: Thread that solves.
-        server: viser server.
-        placement: Places of the bodies and cameras that show them.
-        controls: Controls of the panel.
         recording: Recording of the shown frames, written to `folder`.
         frame: The most recent frame, if there is one.
         newton_frame: The most recent iterate of Newton for this request, if there is one.
@@ -274,18 +269,17 @@ class Page:
             self.worker.submit(self._with_moduli(partial(self._rotating, time.monotonic())))
         seconds, was_slow = self.worker.solving_time, self._is_slow
         self._is_slow = seconds > SLOW
-        if self._is_slow or was_slow or self._changed:
-            self._changed = False
-            self._show_readings(f"Solving for {seconds:.0f} s ..." if self._is_slow else "")
-
-    def _show_readings(self, progress: str) -> None:
-        """Show the readings of the last frame, and the progress or why it cannot be used."""
+        if not (self._is_slow or was_slow or self._changed):
+            return
+        self._changed = False
         frame, settings, controls = self.frame, self.worker.settings, self.controls
-        problem = self._error
-        if frame is not None and not problem:
-            problem = problem_of(frame, has_budget=settings.budget_ms is not None)
         below = newton_table(self.newton_frame) if settings.show_newton else ""
-        below += message(progress) if progress else message(problem, BAD)
+        if self._is_slow:
+            below += message(f"Solving for {seconds:.0f} s ...")
+        elif self._error or frame is None:
+            below += message(self._error, BAD)
+        else:
+            below += message(problem_of(frame, has_budget=settings.budget_ms is not None), BAD)
         if frame is None:
             controls.readings.content = below
         else:

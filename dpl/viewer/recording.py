@@ -1,9 +1,9 @@
 """Recordings of frames: series for ParaView and animations, and one of a rotating load."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import groupby
+from itertools import count, groupby
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,7 @@ class Recording:
     def __init__(self, body: Body) -> None:
         """Create an empty recording, which adds no frames before `start`."""
         self.body, self.running = body, False
-        self.frames: list[tuple[float, Frame]] = []  # times from the first frame on [s]
-        self._begin = 0.0
+        self.frames: list[tuple[float, Frame]] = []  # with times on any clock [s]
 
     def start(self) -> None:
         """Remove all frames and start recording."""
@@ -45,8 +44,7 @@ class Recording:
     def add(self, frame: Frame, time: float) -> None:
         """Append a frame that is shown at a time [s]; ignored if stopped or full."""
         if self.running:
-            self._begin = self._begin if self.frames else time
-            self.frames.append((time - self._begin, frame))
+            self.frames.append((time, frame))
             self.running = len(self.frames) < MAX_FRAMES
 
     def save_series(self, folder: Path) -> Path:
@@ -58,7 +56,7 @@ class Recording:
             load = frame.load.dimensionless(scene)
             with torch.inference_mode():
                 fields = nodal_fields(scene, load, frame.displacement / scene.length)
-            files.append((time, f"{path.stem}/frame_{number:04d}.vtu"))
+            files.append((time - self.frames[0][0], f"{path.stem}/frame_{number:04d}.vtu"))
             arrays = {name: field.numpy() for name, field in fields.items()}
             write_mesh(folder / files[-1][1], scene.problem.mesh_in_metres, arrays)
         write_collection(path, files)
@@ -67,8 +65,6 @@ class Recording:
     def save_animation(self, folder: Path, suffix: str, size: tuple[int, int] = (960, 540)) -> Path:
         """Write an animation in real time, ".gif" or ".mp4", and return its path."""
         path = self._free_path(folder, suffix)
-        frames = resample(self.frames)
-        renderer = Renderer.fitting(self.body, frames, size)
 
         def captions(frame: Frame) -> list[str]:
             answer = frame.answer
@@ -76,32 +72,34 @@ class Recording:
             time, ratio = f"{answer.milliseconds:.1f} ms", f"{answer.volume_ratio:.2f}"
             return [f"estimated error {error}", f"{method}, {time}", f"min det F {ratio}"]
 
-        write_animation(path, frames, renderer, captions)
+        write_animation(path, self.body, resample(self.frames), size, captions)
         return path
 
     def _free_path(self, folder: Path, suffix: str) -> Path:
         """Return the first unused path of recording-001, ..., with and without the suffix."""
         if not self.frames:
             raise ValueError("the recording is empty; start recording first")
-        for number in range(1, 10_000):
-            path = folder / f"recording-{number:03d}{suffix}"
-            if not path.exists() and not path.with_suffix("").exists():
-                return path
-        raise ValueError(f"{folder} contains 9999 recordings; remove some")
+        paths = (folder / f"recording-{number:03d}{suffix}" for number in count(1))
+        return next(p for p in paths if not (p.exists() or p.with_suffix("").exists()))
 
 
 def resample(frames: list[tuple[float, Frame]]) -> list[Frame]:
     """Return the frames shown at multiples of 1 / `FRAME_RATE`, of frames with times [s]."""
     times = np.array([time for time, _ in frames])
-    ticks = np.arange(0.0, times[-1] + 1 / FRAME_RATE, 1 / FRAME_RATE)
+    ticks = np.arange(times[0], times[-1] + 1 / FRAME_RATE, 1 / FRAME_RATE)
     chosen = np.clip(np.searchsorted(times, ticks + 1e-9) - 1, 0, None)
     return [frames[k][1] for k in chosen]
 
 
 def write_animation(
-    path: Path, frames: list[Frame], renderer: Renderer, captions: Callable[[Frame], list[str]]
+    path: Path,
+    body: Body,
+    frames: list[Frame],
+    size: tuple[int, int],
+    captions: Callable[[Frame], list[str]],
 ) -> None:
     """Write frames, `FRAME_RATE` per second, with one colour scale; a GIF loops."""
+    renderer = Renderer.fitting(body, frames, size)
     top = colour_top(np.concatenate([frame.values for frame in frames]))
     images = (
         image
@@ -110,7 +108,17 @@ def write_animation(
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
-        _write_mp4(path, images, renderer.size)
+        import imageio_ffmpeg
+
+        with atomic_write(path) as file:
+            writer = imageio_ffmpeg.write_frames(
+                str(file.name), size, fps=FRAME_RATE, quality=7, macro_block_size=2,
+                output_params=["-f", "mp4"],
+            )  # fmt: skip
+            writer.send(None)
+            for image in images:
+                writer.send(image.tobytes())
+            writer.close()
         return
     # with a common palette, unchanged pixels take no space and do not flicker
     some = [renderer.render(one, top, captions(one)) for one in frames[:: len(frames) // 3 + 1]]
@@ -120,22 +128,6 @@ def write_animation(
     options: dict[str, Any] = {"duration": round(1000 / FRAME_RATE), "loop": 0, "optimize": False}
     with atomic_write(path) as file:
         first.save(file, format="GIF", save_all=True, append_images=others, **options)
-
-
-def _write_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int]) -> None:
-    import imageio_ffmpeg
-
-    part = path.with_name(f".{path.stem}.part.mp4")
-    options = {"fps": FRAME_RATE, "quality": 7, "macro_block_size": 2}
-    writer = imageio_ffmpeg.write_frames(str(part), size, **options)
-    writer.send(None)
-    try:
-        for image in images:
-            writer.send(image.tobytes())
-        writer.close()
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def animate_load(body: Body, path: Path, *, size: tuple[int, int] = (720, 405)) -> None:
@@ -156,8 +148,7 @@ def animate_load(body: Body, path: Path, *, size: tuple[int, int] = (720, 405)) 
         f"sim(force): {median:.1f} ms",
         f"{math.prod(body.scene.problem.shape):,} degrees of freedom",
     ]
-    renderer = Renderer.fitting(body, frames, size)
-    write_animation(path, frames, renderer, lambda frame: captions)
+    write_animation(path, body, frames, size, lambda frame: captions)
 
 
 def rotating_load(body: Body) -> Callable[[float], LoadRequest]:

@@ -56,26 +56,23 @@ def colour_bands(surface: Surface, frame: Frame, top: float) -> list[Floats]:
 def colour_top(values: Floats, before: float = 0.0) -> float:
     """Return the upper end of a colour scale that starts at 0 and contains values.
 
-    It is a rounded number, and stays as `before` unless the values are larger or far smaller.
-    Values that are not finite are ignored.
+    It is one of {1, 1.5, 2, 3, 4, 5, 6, 8} x 10^k, and stays as `before` unless the values are
+    larger or far smaller. Values that are not finite are ignored.
     """
     largest = float(values[np.isfinite(values)].max(initial=0.0))
-    return before if 0.4 * before <= largest <= before else round_up(largest)
+    if largest == 0:
+        return 0.0
+    if 0.4 * before <= largest <= before:
+        return before
+    power = 10.0 ** math.floor(math.log10(largest))
+    steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
+    return power * next((step for step in steps if largest <= step * power * (1 + 1e-9)), 10.0)
 
 
 def engineering(value: float, unit: str) -> str:
     """Return a value with three digits and its unit, such as "1.25 kN" for 1250 and "N"."""
     rounded = float(f"{value:.2e}")
     return EngFormatter(unit).format_data(rounded) if math.isfinite(value) else f"{value} {unit}"
-
-
-def round_up(number: float) -> float:
-    """Return the smallest number {1, 1.5, 2, 3, 4, 5, 6, 8} x 10^k that is not smaller."""
-    if not 0 < number < math.inf:
-        return 0.0
-    power = 10.0 ** math.floor(math.log10(number))
-    steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-    return power * next((step for step in steps if number <= step * power * (1 + 1e-9)), 10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +116,17 @@ class Renderer:
         x, y = 0.22 / figure.get_figwidth(), (1 - 0.18 / 5.4, 1 - 0.58 / 5.4)
         figure.text(x, y[0], title, color=TEXT, size=18, weight="bold", va="top")
         figure.text(x, y[1], others, color=TEXT_GREY, size=12.24, va="top")
-        if top > 0:
-            _draw_legend(figure, frame.quantity, top)
+        if top > 0:  # the colour bar at the right edge
+            wide, high = figure.get_size_inches()
+            bar = figure.add_axes((1 - 0.92 / wide, 0.6 / high, 0.18 / wide, 1 - 1.8 / high))
+            unit, colours = QUANTITIES[frame.quantity], band_colours(frame.quantity) / 255
+            scale = ScalarMappable(Normalize(0, top), ListedColormap(colours))
+            labels = FuncFormatter(lambda value, _: engineering(value, unit))
+            ticks = np.linspace(0, top, 5).tolist()
+            figure.colorbar(scale, cax=bar, ticks=ticks, format=labels).outline.set_visible(False)
+            bar.tick_params(length=0, labelsize=10, labelcolor=TEXT_GREY)
+            place = 1 - 0.22 / wide, 1 - 0.98 / high
+            figure.text(*place, frame.quantity, color=TEXT, size=10, ha="right", va="center")
         canvas.draw()
         return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
@@ -165,16 +171,3 @@ class Renderer:
         brightness = 0.7 + 0.32 * np.abs(normals @ light) / np.linalg.norm(light)
         shades = np.clip(colours * brightness[:, None], 0, 255) / 255
         return soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1)
-
-
-def _draw_legend(figure: Figure, quantity: str, top: float) -> None:
-    """Draw the colour bar at the right edge."""
-    width, height = figure.get_size_inches()
-    bar = figure.add_axes((1 - 0.92 / width, 0.6 / height, 0.18 / width, 1 - 1.8 / height))
-    unit, colours = QUANTITIES[quantity], ListedColormap(band_colours(quantity) / 255)
-    scale, ticks = ScalarMappable(Normalize(0, top), colours), np.linspace(0, top, 5).tolist()
-    labels = FuncFormatter(lambda value, _: engineering(value, unit))
-    figure.colorbar(scale, cax=bar, ticks=ticks, format=labels).outline.set_visible(False)
-    bar.tick_params(length=0, labelsize=10, labelcolor=TEXT_GREY)
-    place = 1 - 0.22 / width, 1 - 0.98 / height
-    figure.text(*place, quantity, color=TEXT, size=10, ha="right", va="center")

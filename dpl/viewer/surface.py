@@ -118,9 +118,6 @@ def _cut(soup: Floats, level: float) -> tuple[Floats, Floats]:
     above = soup[..., 3] >= level
     number = above.sum(axis=1)
     crossed = (number == 1) | (number == 2)
-    whole = number == 3
-    if not crossed.any():
-        return soup[~whole], soup[whole]
     cut, has_lone_above = soup[crossed], number[crossed] == 1
     lone = (above[crossed] == has_lone_above[:, None]).argmax(axis=1)  # on a side of its own
     turned = (lone[:, None] + np.arange(3)) % 3  # keeps the orientation
@@ -129,11 +126,11 @@ def _cut(soup: Floats, level: float) -> tuple[Floats, Floats]:
     p[:, 3] = q[:, 3] = level
     tips = np.stack([a, p, q], axis=1)
     bases = np.stack([p, b, c, p, c, q], axis=1).reshape(-1, 2, 3, 4)
-    sides = [
-        np.concatenate([soup[kept], tips[chosen], bases[~chosen].reshape(-1, 3, 4)])
-        for kept, chosen in (((number == 0), ~has_lone_above), (whole, has_lone_above))
-    ]
-    return sides[0], sides[1]
+    below, over = (
+        np.concatenate([soup[number == kept], tips[chosen], bases[~chosen].reshape(-1, 3, 4)])
+        for kept, chosen in ((0, ~has_lone_above), (3, has_lone_above))
+    )
+    return below, over
 
 
 def exit_distance(points: Floats, triangles: Ints, origin: Floats, direction: Floats) -> float:

@@ -20,29 +20,23 @@ class Worker(threading.Thread):
     `settings` are the most recent ones.
     """
 
+    smoothing_time = 0.06  # time constant of the smoothing [s]; 0: no smoothing
+    min_frame_time = 0.35  # shortest time for which an iterate of Newton is shown [s]
+
     def __init__(
         self,
         body: Body,
         on_frame: Callable[[Frame], None],
         on_newton: Callable[[Frame | None], None] = lambda frame: None,
         on_error: Callable[[str], None] = lambda message: None,
-        *,
-        smoothing_time: float = 0.06,
-        min_frame_time: float = 0.35,
     ) -> None:
         """Create the thread; `start` starts it.
 
-        Args:
-            body: The body.
-            on_frame: Receives each frame.
-            on_newton: Receives each iterate of Newton; None when a new request is solved.
-            on_error: Receives the message of a request that cannot be solved.
-            smoothing_time: Time constant of the smoothing [s]; 0: no smoothing.
-            min_frame_time: Shortest time for which an iterate of Newton is shown [s].
+        Frames, iterates of Newton (None when a new request is solved) and messages of requests
+        that cannot be solved are passed to the functions.
         """
         super().__init__(name="viewer", daemon=True)
         self.body, self.settings = body, ViewSettings()
-        self.smoothing_time, self.min_frame_time = smoothing_time, min_frame_time
         self._on_frame, self._on_newton, self._on_error = on_frame, on_newton, on_error
         self._changed = threading.Condition()
         self._make_request: MakeRequest = body.zero_load

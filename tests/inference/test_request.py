@@ -42,7 +42,7 @@ def test_an_inverted_solution_is_behind_every_valid_one(options, better):
         candidate(2e-9, 2e-9, volume_ratio=math.nan),
         candidate(math.nan, None, volume_ratio=0.0),
     ]
-    request = Request.checked(*options, Durations(), warm=False)
+    request = Request(*options)
     ranks = [request.rank(one) for one in wanted]
     assert ranks == sorted(ranks)
     assert len(set(ranks)) == len(ranks)
@@ -61,7 +61,7 @@ def test_calls_whose_stages_take_random_times_keep_their_budget(monkeypatch, bud
 
     late = iterations = 0
     for _ in range(1000):
-        request = Request.checked(None, budget, None, durations, warm=False)
+        request = Request(budget_ms=budget, durations=durations)
         run("prediction", 1.0)
         while not request.over("iteration"):
             run("iteration", 1.0)
@@ -76,7 +76,7 @@ def test_calls_whose_stages_take_random_times_keep_their_budget(monkeypatch, bud
 
 def test_one_slow_run_does_not_prevent_a_stage_for_ever():
     durations = Durations()
-    request = Request.checked(None, 1e9, None, durations, warm=False)
+    request = Request(budget_ms=1e9, durations=durations)
     durations.add("iteration", 1e12)
     refused = 0
     while request.over("iteration"):

@@ -418,7 +418,8 @@ def test_an_invalid_value_of_a_control_prints_one_line(served, policy, failures,
 
 def test_an_error_in_a_callback_prints_one_line(served, policy, capfd, monkeypatch):
     now = 0.0
-    monkeypatch.setattr(policy.log, "_clock", lambda: now)
+    clock = SimpleNamespace(monotonic=lambda: now)
+    monkeypatch.setattr("dpl.viewer.access.time", clock)
     monkeypatch.setattr(served, "_submit", None)  # every call fails
     monkeypatch.setattr(served.worker, "submit", None)
     event = SimpleNamespace(client=object(), target=SimpleNamespace(value="VTU"))
@@ -445,9 +446,11 @@ def test_errors_of_functions_and_coroutines_are_reported(capfd):
     assert capfd.readouterr().err.splitlines() == [failures, failures], "no warning"
 
 
-def test_one_line_per_second_is_printed_and_others_are_counted(capfd):
+def test_one_line_per_second_is_printed_and_others_are_counted(capfd, monkeypatch):
     now = 5.0
-    complaints = RateLimitedHandler(lambda: now)
+    clock = SimpleNamespace(monotonic=lambda: now)
+    monkeypatch.setattr("dpl.viewer.access.time", clock)
+    complaints = RateLimitedHandler()
     lines = []
     for step in (0.0, 0.25, MIN_INTERVAL - 0.25 - 2**-20, 2**-20, 0.5, 3.0, 0.0):
         now += step

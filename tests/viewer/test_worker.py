@@ -28,8 +28,9 @@ def make_worker(body, shown, monkeypatch):
     monkeypatch.setattr("dpl.viewer.worker.time", clock)
     workers = []
 
-    def make(**more):
+    def make(*, smoothing_time=0.0, **more):
         worker = Worker(body, shown.append, **more)
+        worker.smoothing_time = smoothing_time
         worker.start()
         workers.append(worker)
         assert worker.wait(LONG)
@@ -86,14 +87,14 @@ def test_there_is_one_frame_where_nothing_can_be_interpolated(make_worker, body,
         assert worker.wait(LONG)
         assert len(shown) == before + 1
     assert shown[-1].answer.converged
-    before, worker = len(shown) + 1, make_worker(smoothing_time=0.0)
+    before, worker = len(shown) + 1, make_worker()
     worker.submit(lambda: body.sample(1))
     assert worker.wait(LONG)
     assert len(shown) == before + 1
 
 
 def test_the_time_of_a_solve_is_known_while_it_lasts(make_worker, body):
-    worker = make_worker(smoothing_time=0.0)
+    worker = make_worker()
     assert worker.solving_time == 0
     began, end = threading.Event(), threading.Event()
 
@@ -111,7 +112,7 @@ def test_the_time_of_a_solve_is_known_while_it_lasts(make_worker, body):
 
 
 def test_of_many_requests_only_the_most_recent_is_solved(make_worker, body, shown):
-    worker = make_worker(smoothing_time=0.0)
+    worker = make_worker()
     requested, first = [], threading.Event()
 
     def make(index):
@@ -132,7 +133,8 @@ def test_of_many_requests_only_the_most_recent_is_solved(make_worker, body, show
 
 def test_newton_iterates_are_shown_until_a_new_load_arrives(make_worker, body, shown):
     newton = []
-    worker = make_worker(smoothing_time=0.0, min_frame_time=0.02, on_newton=newton.append)
+    worker = make_worker(on_newton=newton.append)
+    worker.min_frame_time = 0.02
     load = body.sample(1)
     worker.submit(lambda: load, ViewSettings(show_newton=True))
     assert worker.wait(LONG)
@@ -151,7 +153,7 @@ def test_newton_iterates_are_shown_until_a_new_load_arrives(make_worker, body, s
 
 def test_an_error_is_reported_and_the_next_load_is_solved(make_worker, body, shown):
     messages = []
-    worker = make_worker(smoothing_time=0.0, on_error=messages.append)
+    worker = make_worker(on_error=messages.append)
     worker.submit(lambda: replace(body.zero_load(), young=-1.0))
     assert worker.wait(LONG)
     assert messages == ["young: a modulus is not above 0 Pa"]
