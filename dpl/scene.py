@@ -162,11 +162,9 @@ class Scene:
     def load_of(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Load:
         """Return nodal forces (B, N, D) [N] (2D: [N/m]) on bodies of moduli (B,) [Pa] as a load.
 
-        Args:
-            force: Nodal forces.
-            young: E. On a body with an elastic foundation or with follower loads it must be that of
-                the body, see `Problem.check_modulus`, which this function does not call.
-            parameters: Values of `Problem.parameter_ranges`, (B,) or (B, P), if there are any.
+        On a body with an elastic foundation or with follower loads the moduli must be that of the
+        body, see `Problem.check_modulus`, which this function does not call. Parameters are values
+        of `Problem.parameter_ranges`, (B,) or (B, P), if there are any.
         """
         dimensionless = force.double() / (young.double()[:, None, None] * self.force_unit)
         parameters = None if parameters is None else parameters.double()

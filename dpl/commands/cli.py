@@ -91,10 +91,8 @@ def command(
 def help_page(name: str, about: str, lines: Sequence[str]) -> str:
     """Return the help of a command within `dry_run.initialized`.
 
-    Args:
-        name: Name of the command's configuration.
-        about: Docstring of the command's module.
-        lines: Overrides. The files are those of the chosen options.
+    `name` is that of its configuration, `about` the docstring of its module. The files are those of
+    the options that the overrides `lines` choose.
     """
     single = [line for line in lines if not dry_run.parsed(line).is_sweep_override()]
     cfg = dry_run.composed(name, single)

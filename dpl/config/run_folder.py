@@ -38,13 +38,8 @@ def with_copied_files(
 ) -> tuple[DictConfig, dict[str, tuple[Path, Path]]]:
     """Return a configuration that reads the files of its scene from their copies in a folder.
 
-    Args:
-        cfg: The configuration.
-        folder: Folder of the run.
-        required: Refuse files without a copy; else these are read from where they are.
-
-    Returns:
-        The configuration, and the path and the place of the copy of each file, by key.
+    The path and the place of the copy of each file, by key, are returned too. Files without a copy
+    are read from where they are, or refused if copies are `required`.
     """
     found, files = to_container(cfg), {}
     scene = {key: found[key] for key in OF_SCENE if key in found}
@@ -107,14 +102,9 @@ def load_run(
     """Return the configuration and the best surrogate of a training run.
 
     If the run has chosen its number of training loads (`data=growing`), the number of the best fit
-    replaces `data.train` in the configuration.
-
-    Args:
-        folder: Folder of the run.
-        scene: Scene of the run, if it is built already.
-        trust: Import and call objects outside this package, such as your own law, that the
-            configuration names.
-        keys: Keys of the configuration to read, at least `PREDICTION`; None for all.
+    replaces `data.train` in the configuration. `trust` allows objects outside this package, see
+    `load`. `scene` is that of the run, if it is built already. `keys` are the keys of the
+    configuration to read, at least `PREDICTION`; None for all.
     """
     config, best = files_of_run(folder)
     cfg = OmegaConf.create(checked_config(config, trust=trust, keys=keys))

@@ -43,13 +43,10 @@ RANGE = (
 def write_folder(
     surrogate: TrainedSurrogate, folder: Path, *, tol: float, errors: Mapping[str, Any] | None
 ) -> None:
-    """Write all files except the report for a surrogate whose graph lies in the folder.
+    """Write all files except the report for a surrogate whose model.onnx lies in the folder.
 
-    Args:
-        surrogate: The surrogate.
-        folder: The folder, with model.onnx.
-        tol: Largest relative difference of ONNX and torch [-].
-        errors: Errors on the test set, see `dpl.training.metrics`, if the run was evaluated.
+    `tol` is the largest relative difference of ONNX and torch [-]. `errors` are those on the test
+    set, see `dpl.training.metrics`, if the run was evaluated.
     """
     scene, loads = surrogate.scene, surrogate.scene.loads
     (folder / "reference").mkdir(parents=True, exist_ok=True)

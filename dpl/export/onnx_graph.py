@@ -32,14 +32,8 @@ def export_onnx(surrogate: TrainedSurrogate, path: Path) -> None:
     """Write a surrogate as an ONNX file, and weights above 2 GB as `<path>.data`.
 
     The inputs are those of `Scene.si_inputs`, the output is `displacement`, (B, N, D) [m]. Older
-    files are replaced.
-
-    Args:
-        surrogate: The surrogate, on the CPU.
-        path: The file.
-
-    Raises:
-        ValueError: The network has control flow that depends on values, or a fixed batch size.
+    files are replaced. The surrogate is on the CPU. A network with a fixed batch size, or control
+    flow that depends on values, is a ValueError.
     """
     import onnx
 

@@ -136,7 +136,8 @@ class LinearResponse:
     def _supports(self) -> Tensor:
         """Forces of `StiffnessTerms.support_forces` by parity, (T + 1, M m)."""
         forces = self.terms.support_forces()[:, self.scene.problem.free.cpu()]
-        return torch.stack([self.form.parts(force).flatten() for force in forces])
+        parities, orbits, _ = self.form
+        return torch.stack([orbits.by_parity(force, parities).flatten() for force in forces])
 
     def dead_loads(self, force: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return loads without ranged follower loads: forces (B, N, D) and parameters of the law.
@@ -329,7 +330,7 @@ def _largest(right: Tensor) -> Tensor:
 
 def _solutions(blocks: Condensed, forces: Parts) -> Parts:
     """Return the solutions of forces, (M, m) each, in the type of the blocks."""
-    (table, unknowns, _), values = blocks
+    table, unknowns, _, values = blocks
     solutions = np.empty(forces.shape, values.dtype)
     condensed_solves(table, unknowns, values, forces.astype(values.dtype), solutions)
     return solutions

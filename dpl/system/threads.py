@@ -20,18 +20,12 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 
-def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
-
-
 def leave_cores(workers: int) -> None:
     """Limit torch to the cores that worker processes leave, at least one.
 
     Threads of one operation wait for each other, so none may share a core with a worker.
     """
-    left = max(1, available_cores() - workers)
+    left = max(1, len(os.sched_getaffinity(0)) - workers)
     torch.set_num_threads(min(torch.get_num_threads(), left))
 
 

@@ -38,10 +38,6 @@ class OrbitForm(NamedTuple):
         node = problem.free.nonzero()[orbits.images[0], 0]
         return cls(parities, orbits, problem.points[node].numpy())
 
-    def parts(self, force: Tensor) -> Tensor:
-        """Return the products of a force at free degrees of freedom, (n,), with fields, (M, m)."""
-        return self.orbits.by_parity(force, self.parities)
-
     def matrices(self, problem: Problem) -> list[csr_array]:
         """Return C^T K(0) C, (m, m), of the fields C of each parity, one for each orbit.
 
@@ -78,8 +74,8 @@ class ParityFactor(Factor):
             SingularMatrix: K(0) is not positive definite.
         """
         form = OrbitForm.of(problem, group)
-        fronts, values = condense(form.matrices(problem), form.points)
-        blocks = Condensed(fronts, values.astype(np.float32))
+        exact = condense(form.matrices(problem), form.points)
+        blocks = exact._replace(values=exact.values.astype(np.float32))
         return cls(blocks, form.orbits, form.parities.characters)
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
@@ -87,8 +83,8 @@ class ParityFactor(Factor):
         images, signs, scales, characters = self._arrays
         parts = characters @ (scales * right[images])
         solved = np.empty_like(parts)
-        table, unknowns, _ = self.blocks.fronts
-        condensed_solves(table, unknowns, self.blocks.values, parts, solved)
+        table, unknowns, _, values = self.blocks
+        condensed_solves(table, unknowns, values, parts, solved)
         x = np.empty_like(right)
         x[images] = signs * (characters.T @ solved)
         return x
