@@ -2,13 +2,12 @@
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from dpl.fem import (
@@ -305,8 +304,3 @@ def _differences(theirs: Any, ours: Mapping[str, Any], path: str = "") -> list[s
             digest = isinstance(a, str) and len(a) == 64
             lines.append(f"{place}: " + ("differ" if digest else f"{a} there, {b} here"))
     return lines
-
-
-def stack(samples: Sequence[Sample]) -> Sample:
-    """Return single samples (N, D) as a batch (B, N, D)."""
-    return Sample(*(torch.stack(column) for column in zip(*samples, strict=True)))

@@ -25,32 +25,26 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", "data.DataModule", "dpl.Surroga
     scene = config.build_scene(config.with_files_of_resumed(cfg))
     module = config.instantiate(cfg, "data", scene=scene)
     surrogate = config.build_surrogate(cfg, scene)
-    _check_data(surrogate, module.source)
+    is_fitted, grows = surrogate.predictor.is_closed_form, isinstance(module.source, data.Growing)
+    name = type(surrogate.net).__name__
+    if grows and not is_fitted:
+        raise config.ConfigError(
+            f"data=growing needs a model that is fitted, such as unrolled; {name} is trained by "
+            "gradient descent: set data.train to a number"
+        )
+    if is_fitted and isinstance(module.source, data.Stream):
+        raise config.ConfigError(f"data: {name} is fitted to solved loads; set data=offline")
     if resumed is not None:
-        grows = isinstance(module.source, data.Growing)
         config.check_weights(surrogate, resumed, grows=grows)
         if grows:
             with config.error_in("ckpt_path", LookupError, TypeError, ValueError):
                 module.load_state_dict(resumed["DataModule"])
     trainer = config.build_trainer(cfg)
-    if not surrogate.predictor.is_closed_form:
+    if not is_fitted:
         cli.check_trainer(trainer, cfg)
         if resumed is not None:
             config.check_callbacks(trainer, resumed)
     return scene, module, surrogate, trainer
-
-
-def _check_data(surrogate: "dpl.Surrogate", source: "data.Source") -> None:
-    """Raise a `ConfigError` if a model cannot be trained on samples of this source."""
-    name = type(surrogate.net).__name__
-    if not surrogate.predictor.is_closed_form:
-        if isinstance(source, data.Growing):
-            raise config.ConfigError(
-                f"data=growing needs a model that is fitted, such as unrolled; {name} is trained "
-                "by gradient descent: set data.train to a number"
-            )
-    elif isinstance(source, data.Stream):
-        raise config.ConfigError(f"data: {name} is fitted to solved loads; set data=offline")
 
 
 @cli.command("train", rehearse=parts)

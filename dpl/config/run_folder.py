@@ -29,6 +29,10 @@ from dpl.version import install
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
 OF_SCENE = (*SCENE, "fixed", "regions")
 PREDICTION = (*OF_SCENE, "model", "seed")  # keys of a run that `load` reads
+DAMAGED = (  # errors of a damaged checkpoint
+    *(OSError, ValueError, TypeError, LookupError),
+    *(AttributeError, RuntimeError, ArithmeticError),
+)
 HUB = "hf://"  # begins the names of runs on the Hugging Face Hub
 SHARED = ["config.yaml", "checkpoints/*.safetensors", "*.vtu", "*.npy", "*.npz", "*.safetensors"]
 
@@ -110,7 +114,7 @@ def load_run(
     cfg = OmegaConf.create(checked_config(config, trust=trust, keys=keys))
     if not trust:
         cfg = with_own_data(cfg, Path(folder))
-    with usable(best):
+    with error_in(unusable := f"{best} cannot be used", *DAMAGED):
         checkpoint = checkpoints.read(best)
         if (points := checkpoint.get(checkpoints.DATA, {}).get("points")) and "data" in cfg:
             cfg.data.train = int(points[-1][0])
@@ -124,20 +128,11 @@ def load_run(
         with contextlib.nullcontext() if trust else refused:
             scene = build_scene(own)
     surrogate = build_trained(cfg, scene)
-    with usable(best):
+    with error_in(unusable, *DAMAGED):
         checkpoints.check_scene(checkpoint, scene)
         surrogate.load_state_dict(checkpoint["state_dict"])
         surrogate.eval().check_predictions()
     return cfg, surrogate
-
-
-def usable(checkpoint: str | Path) -> contextlib.AbstractContextManager[None]:
-    """Turn the errors of a damaged checkpoint into a `ConfigError` that names it."""
-    return error_in(
-        f"{checkpoint} cannot be used",
-        *(OSError, ValueError, TypeError, LookupError),
-        *(AttributeError, RuntimeError, ArithmeticError),
-    )
 
 
 def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":

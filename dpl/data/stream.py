@@ -14,7 +14,7 @@ from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.solving.worker_pool import solve_loads
 from dpl.data.sources import MAX_COUNT, Source
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
-from dpl.scene import Sample, Scene, stack
+from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.memory import machine, refuse_beyond
 from dpl.system.threads import leave_cores
@@ -246,7 +246,8 @@ class ReplayBuffer:
             while budget >= self.batch_size and self._uses_left.sum() >= self.batch_size:
                 budget -= self.batch_size
                 self._used += self.batch_size
-                batch = stack([self._samples[place] for place in self._choose()])
+                singles = (self._samples[place] for place in self._choose())
+                batch = Sample(*map(torch.stack, zip(*singles, strict=True)))
                 if self.group:
                     shape = (self.batch_size,)
                     which = torch.randint(len(self.group), shape, generator=self._generator)

@@ -81,12 +81,7 @@ def _silence_exporter() -> Iterator[None]:
 
 
 class OnnxSession:
-    """ONNX file, evaluated by onnxruntime on one thread.
-
-    Attributes:
-        inputs: Names of the inputs, in order.
-        outputs: Names of the outputs, in order.
-    """
+    """ONNX file, evaluated by onnxruntime on one thread; `inputs` are the names of its inputs."""
 
     def __init__(self, path: Path) -> None:
         """Load an ONNX file."""
@@ -98,7 +93,6 @@ class OnnxSession:
             str(path), options, providers=["CPUExecutionProvider"]
         )
         self.inputs = [one.name for one in self._session.get_inputs()]
-        self.outputs = [one.name for one in self._session.get_outputs()]
 
     def __call__(self, **inputs: Array | Tensor) -> Array:
         """Return displacements (B, N, D) [m] of the inputs of the graph, by name."""

@@ -191,7 +191,7 @@ class LinearResponse:
         if not self.terms.varies:
             return partial(_solutions, self.blocks)
         shape, dtype = self.orbits.dofs.shape, self.blocks.values.dtype
-        matrix, ends = self._matrices.at(factors), (self.terms.rtol, self.terms.max_steps)
+        matrix, ends = self._matrices.at(factors), (self.terms.rtol, 2 * self.terms.bound)
 
         def precondition(residual: Array) -> Array:
             return _solutions(self.blocks, residual.reshape(shape)).astype(np.float64).ravel()
@@ -263,7 +263,7 @@ class LinearResponse:
         def product(x: Tensor) -> Tensor:
             return (matrix * x[:, columns]).sum(dim=-1)
 
-        ends = self.terms.rtol, self.terms.max_steps
+        ends = self.terms.rtol, 2 * self.terms.bound
         return conjugate_gradients_of_tensors(product, of_node, right, *ends)
 
     def _orbits(self, device: torch.device) -> list[Tensor]:

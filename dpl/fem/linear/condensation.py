@@ -252,11 +252,26 @@ class Layer(NamedTuple):
 
 def condensed_layers(blocks: Condensed, device: torch.device | str) -> list[Layer]:
     """Return the blocks on a device, in their dtype, fronts without children first."""
-    table, heights = blocks.table, blocks.heights
-    classes = np.rint(2 * np.log2(table[:, 1] - table[:, 0]))  # similar numbers of pivots
-    kinds = sorted(set(zip(heights.tolist(), classes.tolist(), strict=True)))
-    chosen = (np.flatnonzero((heights == h) & (classes == c)) for h, c in kinds)
-    return [Layer(*(part.to(device) for part in _layer(blocks, fronts))) for fronts in chosen]
+    table, unknowns, heights, values = blocks
+    size, widths = len(np.unique(unknowns)), np.diff(table[:, :3])  # numbers of pivots, boundary
+    kinds = np.stack([heights, np.rint(2 * np.log2(widths[:, 0])).astype(int)], axis=1)
+    layers = []
+    for kind in np.unique(kinds, axis=0):  # one height, similar numbers of pivots
+        chosen = np.flatnonzero((kinds == kind).all(axis=1))
+        count, others = np.maximum(widths[chosen].max(axis=0), 1)  # graphs have no empty tensors
+        pivots, boundary = (np.full((len(chosen), width), size) for width in (count, others))
+        inverse = np.zeros((len(values), len(chosen), count, count), values.dtype)
+        coupling = np.zeros((len(values), len(chosen), count, others), values.dtype)
+        for k, (first, middle, last, place) in enumerate(table[chosen].tolist()):
+            own, other = middle - first, last - middle
+            pivots[k, :own], boundary[k, :other] = unknowns[first:middle], unknowns[middle:last]
+            block = values[:, place : place + own * (own + other)]
+            square, rest = np.split(block, [own * own], axis=1)
+            inverse[:, k, :own, :own] = square.reshape(len(values), own, own)
+            coupling[:, k, :own, :other] = rest.reshape(len(values), own, other)
+        arrays = pivots, boundary, inverse, coupling
+        layers.append(Layer(*(torch.from_numpy(array).to(device) for array in arrays)))
+    return layers
 
 
 def solve_layers(layers: Sequence[Layer], right: Tensor) -> Tensor:
@@ -277,22 +292,3 @@ def solve_layers(layers: Sequence[Layer], right: Tensor) -> Tensor:
         found = (own - outer @ layer.coupling.transpose(2, 3)).transpose(1, 2).flatten(2)
         solution = solution.index_add(2, layer.pivots.flatten(), found)
     return solution[..., :-1]
-
-
-def _layer(blocks: Condensed, numbers: Integers) -> Layer:
-    """Return some fronts, by their numbers."""
-    table, unknowns, _, values = blocks
-    size, ends = len(np.unique(unknowns)), table[numbers]
-    count = int((ends[:, 1] - ends[:, 0]).max())
-    others = max(1, int((ends[:, 2] - ends[:, 1]).max()))  # graphs have no empty tensors
-    shape = len(numbers), count, others
-    pivots, boundary = np.full(shape[:2], size), np.full((len(numbers), others), size)
-    inverse = np.zeros((len(values), len(numbers), count, count), values.dtype)
-    coupling = np.zeros((len(values), *shape), values.dtype)
-    for k, (first, middle, last, place) in enumerate(ends.tolist()):
-        own, other = middle - first, last - middle
-        pivots[k, :own], boundary[k, :other] = unknowns[first:middle], unknowns[middle:last]
-        square, rest = np.split(values[:, place : place + own * (own + other)], [own * own], axis=1)
-        inverse[:, k, :own, :own] = square.reshape(len(values), own, own)
-        coupling[:, k, :own, :other] = rest.reshape(len(values), own, other)
-    return Layer(*map(torch.from_numpy, (pivots, boundary, inverse, coupling)))
