@@ -1,7 +1,6 @@
 """Start and end of a command: configuration, checks, one line for invalid input."""
 
 import contextlib
-import errno
 import functools
 import logging
 import math
@@ -31,8 +30,6 @@ from dpl.version import install
 OmegaConf.register_new_resolver(
     "dpl.name", lambda text: re.sub(r"[^\w.]+", "-", text).strip("-"), replace=True
 )
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
-FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 WIDTH = 100  # columns
 FLAGS = """
 Flags:
@@ -137,7 +134,9 @@ def readable_errors() -> Iterator[None]:
                 cause = cause.__cause__ or cause.__context__
             if not isinstance(cause, OSError):
                 raise
-            line = _describe(cause)
+            where = f" for {cause.filename}" if cause.filename else ""
+            remedy = "free some space, change permissions, or choose another folder"
+            line = f"{cause.strerror}{where}; existing files are intact; {remedy}, and try again"
         print(f"error: {line}", file=sys.stderr)
         if HydraConfig.initialized():  # remove the empty folders of a run that did not start
             folder = Path(HydraConfig.get().runtime.output_dir)
@@ -161,18 +160,6 @@ def _quieten() -> None:
         "The dirpath has changed",
     ):
         warnings.filterwarnings("ignore", message)
-
-
-def _describe(error: OSError) -> str:
-    """Return one line with the failed file access and the remedy."""
-    problem, remedy = error.strerror, "choose another folder or repair this one"
-    if error.errno in FULL:
-        problem, remedy = "no space left", "free some space"
-    elif error.errno in FORBIDDEN:
-        problem = "no permission to write"
-        remedy = "choose another folder or change its permissions"
-    where = f" for {error.filename}" if error.filename else ""
-    return f"{problem}{where}; existing files are intact: {remedy} and run the same command again"
 
 
 def extra(cfg: DictConfig, name: str) -> bool:
