@@ -48,15 +48,11 @@ def command(
 ) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
     """Return a decorator that turns a function of a configuration into a command.
 
-    All jobs are checked before the first one starts. Invalid input ends the command with one line
-    and status 2, Ctrl-C with status 130, SIGTERM with status 143.
-
-    Args:
-        name: Name of the configuration, which Hydra composes from `NAME.yaml` and the command line.
-        rehearse: Builds the objects of a job without computing, see `dpl.commands.dry_run.check`.
-        conf: Folder of the configuration. Its `hydra.searchpath` may contain `${oc.env:DPL_CONF}`,
-            the folder of the configurations of this package.
-        keys: Keys of the configuration besides `dpl.config.validation.KEYS`, in the same form.
+    Hydra composes the configuration from `NAME.yaml` in the folder `conf` and the command line. Its
+    `hydra.searchpath` may contain `${oc.env:DPL_CONF}`, the folder of the configurations of this
+    package. All jobs are checked before the first one starts, see `dpl.commands.dry_run.check` for
+    `rehearse` and `keys`. Invalid input ends the command with one line and status 2, Ctrl-C with
+    status 130, SIGTERM with status 143.
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:

@@ -174,12 +174,9 @@ def _solve_reference(
 ) -> tuple[dict[str, Array], dict[str, Any]]:
     """Return the first random load for which Newton converges, and its entry in meta.json.
 
-    Of `max_loads` loads the last one is taken in any case.
-
-    Returns:
-        Arrays by file name: the inputs of the graph with B = 1, `displacement` of the surrogate
-        and `fe_displacement`, (1, N, D) [m]. The entry has the shapes of the arrays, the relative
-        residuals of both displacements, `fe_converged`, and their relative difference `error` [-].
+    Of `max_loads` loads the last one is taken in any case. The arrays, by file name, are the inputs
+    of the graph with B = 1 and both displacements, (1, N, D) [m]. Residuals and `error`, the
+    difference of the displacements, are relative [-].
     """
     scene = surrogate.scene
     for k in range(max_loads):

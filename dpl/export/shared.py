@@ -64,13 +64,9 @@ def write_published(
 ) -> Path:
     """Write what `dpl.load` needs of a run, with a card for a model hub; return the card.
 
-    Args:
-        scene: Scene of the run.
-        folder: Folder, which must be empty or new, else a ValueError is raised.
-        config: The configuration of the prediction.
-        files: Files of the scene in the folder of the run.
-        run: Folder of the run; one without weights in the format safetensors is a ValueError.
-        license: Identifier of the licence (SPDX).
+    `config` is the configuration of the prediction, `files` are those of the scene in the folder
+    `run`, `license` is the SPDX identifier. A folder that is not empty, and a run without weights
+    in the format safetensors, are ValueErrors.
     """
     weights = run / "checkpoints" / "best.safetensors"
     if not weights.is_file():

@@ -20,12 +20,17 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
 def leave_cores(workers: int) -> None:
     """Limit torch to the cores that worker processes leave, at least one.
 
     Threads of one operation wait for each other, so none may share a core with a worker.
     """
-    left = max(1, len(os.sched_getaffinity(0)) - workers)
+    left = max(1, available_cores() - workers)
     torch.set_num_threads(min(torch.get_num_threads(), left))
 
 

@@ -100,13 +100,10 @@ class Condensed(NamedTuple):
 
 
 def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Condensed:
-    """Return the blocks in float64 of P symmetric positive definite matrices, (n, n).
+    """Return the blocks in float64 of P symmetric matrices, (n, n), of a similar structure.
 
-    The matrices have a similar structure. The fronts are chosen by the points, (n, D), the
-    positions of the unknowns.
-
-    Raises:
-        SingularMatrix: A matrix is not positive definite.
+    The fronts are chosen by the points, (n, D), the positions of the unknowns. A matrix that is not
+    positive definite raises a `SingularMatrix`.
     """
     graph = csr_array(sum(abs(matrix) for matrix in matrices))
     tree: list[tuple[Integers, tuple[int, ...]]] = []

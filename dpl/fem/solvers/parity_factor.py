@@ -68,11 +68,7 @@ class ParityFactor(Factor):
 
     @classmethod
     def of(cls, problem: Problem, group: SymmetryGroup) -> Self:
-        """Factorise K(0) of a body.
-
-        Raises:
-            SingularMatrix: K(0) is not positive definite.
-        """
+        """Factorise K(0) of a body; raise a `SingularMatrix` if it is not positive definite."""
         form = OrbitForm.of(problem, group)
         exact = condense(form.matrices(problem), form.points)
         blocks = exact._replace(values=exact.values.astype(np.float32))
