@@ -140,8 +140,12 @@ def _evaluate(cfg: DictConfig, scene: "dpl.Scene", trainer: Any, session: Any) -
         raise training.Diverged(message + "lower optimizer.lr")
     session.finish(trainer, prediction.errors)
     if HydraConfig.get().mode != RunMode.MULTIRUN:
-        logs = any(isinstance(one, TensorBoardLogger) for one in trainer.loggers)
-        show_next_commands(folder, tensorboard=logs)
+        print(f"\nwritten to {_from_here(folder)}; next:")
+        print(f"  {_script('view')} {_run_key(folder)}      # in the browser")
+        print(f"  {_script('evaluate')} {_run_key(folder)}  # this table", flush=True)
+        if any(isinstance(one, TensorBoardLogger) for one in trainer.loggers):
+            logs = shlex.quote(_from_here(folder))
+            print(f"  {_program('tensorboard')} --logdir {logs}", flush=True)
     if cli.extra(cfg, "view"):
         from dpl import viewer
         from dpl.commands.view import serve
@@ -149,16 +153,6 @@ def _evaluate(cfg: DictConfig, scene: "dpl.Scene", trainer: Any, session: Any) -
         policy = viewer.AccessPolicy.bind("127.0.0.1", 0, [])  # any free port
         body = viewer.Body(dpl.Simulator(best))
         serve(body, policy, title=_from_here(folder), folder=folder / "view")
-
-
-def show_next_commands(folder: Path, *, tensorboard: bool) -> None:
-    """Print the folder of a run and the commands that use it."""
-    print(f"\nwritten to {_from_here(folder)}; next:")
-    print(f"  {_script('view')} {_run_key(folder)}      # in the browser")
-    print(f"  {_script('evaluate')} {_run_key(folder)}  # this table")
-    if tensorboard:
-        logs = shlex.quote(_from_here(folder))
-        print(f"  {_program('tensorboard')} --logdir {logs}", flush=True)
 
 
 def session_overrides() -> list[str]:
