@@ -136,8 +136,7 @@ class LinearResponse:
     def _supports(self) -> Tensor:
         """Forces of `StiffnessTerms.support_forces` by parity, (T + 1, M m)."""
         forces = self.terms.support_forces()[:, self.scene.problem.free.cpu()]
-        parities, orbits, _ = self.form
-        return torch.stack([orbits.by_parity(force, parities).flatten() for force in forces])
+        return torch.stack([self.form.parts(force).flatten() for force in forces])
 
     def dead_loads(self, force: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return loads without ranged follower loads: forces (B, N, D) and parameters of the law.

@@ -38,6 +38,10 @@ class OrbitForm(NamedTuple):
         node = problem.free.nonzero()[orbits.images[0], 0]
         return cls(parities, orbits, problem.points[node].numpy())
 
+    def parts(self, force: Tensor) -> Tensor:
+        """Return the products of a force at free degrees of freedom, (n,), with fields, (M, m)."""
+        return self.orbits.by_parity(force, self.parities)
+
     def matrices(self, problem: Problem) -> list[csr_array]:
         """Return C^T K(0) C, (m, m), of the fields C of each parity, one for each orbit.
 
