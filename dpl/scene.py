@@ -2,13 +2,12 @@
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from dpl.fem import (
@@ -162,11 +161,9 @@ class Scene:
     def load_of(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Load:
         """Return nodal forces (B, N, D) [N] (2D: [N/m]) on bodies of moduli (B,) [Pa] as a load.
 
-        Args:
-            force: Nodal forces.
-            young: E. On a body with an elastic foundation or with follower loads it must be that of
-                the body, see `Problem.check_modulus`, which this function does not call.
-            parameters: Values of `Problem.parameter_ranges`, (B,) or (B, P), if there are any.
+        On a body with an elastic foundation or with follower loads the moduli must be that of the
+        body, see `Problem.check_modulus`, which this function does not call. Parameters are values
+        of `Problem.parameter_ranges`, (B,) or (B, P), if there are any.
         """
         dimensionless = force.double() / (young.double()[:, None, None] * self.force_unit)
         parameters = None if parameters is None else parameters.double()
@@ -307,8 +304,3 @@ def _differences(theirs: Any, ours: Mapping[str, Any], path: str = "") -> list[s
             digest = isinstance(a, str) and len(a) == 64
             lines.append(f"{place}: " + ("differ" if digest else f"{a} there, {b} here"))
     return lines
-
-
-def stack(samples: Sequence[Sample]) -> Sample:
-    """Return single samples (N, D) as a batch (B, N, D)."""
-    return Sample(*(torch.stack(column) for column in zip(*samples, strict=True)))

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from dpl import Sample
 from dpl.fem import Box, Newton, Plane, SaintVenantKirchhoff, Tag, box, rectangle, solve
 from dpl.fem.identity import identity_of
 from dpl.fem.loads import log_tail_mixture, logarithmic, normal, symmetric_uniform, uniform01
-from dpl.scene import stack
 
 
 def mild(t, *, factor):
@@ -167,19 +165,6 @@ def test_displacements_in_metres_do_not_depend_on_who_made_them_dimensionless(ma
 def test_a_scene_has_one_factor_of_its_rest_stiffness(scene):
     assert scene.linear is scene.solver.linear_solver is scene.loads.linear
     assert scene.linear.factor is scene.linear.factor
-
-
-def test_stacked_samples_are_a_batch():
-    singles = [
-        Sample(torch.full((4, 3), k), torch.full((4, 3), -k), torch.tensor(k))
-        for k in (1.0, 2.0, 3.0)
-    ]
-    batch = stack(singles)
-    assert isinstance(batch, Sample)
-    assert batch.force.shape == (3, 4, 3)
-    assert batch.young.tolist() == [1.0, 2.0, 3.0]
-    assert batch.displacement[:, 0, 0].tolist() == [-1.0, -2.0, -3.0]
-    assert torch.equal(batch.load.force, batch.force)
 
 
 def lines_with(scene, words):

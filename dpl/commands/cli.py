@@ -1,7 +1,6 @@
 """Start and end of a command: configuration, checks, one line for invalid input."""
 
 import contextlib
-import errno
 import functools
 import logging
 import math
@@ -31,8 +30,6 @@ from dpl.version import install
 OmegaConf.register_new_resolver(
     "dpl.name", lambda text: re.sub(r"[^\w.]+", "-", text).strip("-"), replace=True
 )
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
-FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 WIDTH = 100  # columns
 FLAGS = """
 Flags:
@@ -51,15 +48,11 @@ def command(
 ) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
     """Return a decorator that turns a function of a configuration into a command.
 
-    All jobs are checked before the first one starts. Invalid input ends the command with one line
-    and status 2, Ctrl-C with status 130, SIGTERM with status 143.
-
-    Args:
-        name: Name of the configuration, which Hydra composes from `NAME.yaml` and the command line.
-        rehearse: Builds the objects of a job without computing, see `dpl.commands.dry_run.check`.
-        conf: Folder of the configuration. Its `hydra.searchpath` may contain `${oc.env:DPL_CONF}`,
-            the folder of the configurations of this package.
-        keys: Keys of the configuration besides `dpl.config.validation.KEYS`, in the same form.
+    Hydra composes the configuration from `NAME.yaml` in the folder `conf` and the command line. Its
+    `hydra.searchpath` may contain `${oc.env:DPL_CONF}`, the folder of the configurations of this
+    package. All jobs are checked before the first one starts, see `dpl.commands.dry_run.check` for
+    `rehearse` and `keys`. Invalid input ends the command with one line and status 2, Ctrl-C with
+    status 130, SIGTERM with status 143.
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
@@ -91,10 +84,8 @@ def command(
 def help_page(name: str, about: str, lines: Sequence[str]) -> str:
     """Return the help of a command within `dry_run.initialized`.
 
-    Args:
-        name: Name of the command's configuration.
-        about: Docstring of the command's module.
-        lines: Overrides. The files are those of the chosen options.
+    `name` is that of its configuration, `about` the docstring of its module. The files are those of
+    the options that the overrides `lines` choose.
     """
     single = [line for line in lines if not dry_run.parsed(line).is_sweep_override()]
     cfg = dry_run.composed(name, single)
@@ -139,7 +130,9 @@ def readable_errors() -> Iterator[None]:
                 cause = cause.__cause__ or cause.__context__
             if not isinstance(cause, OSError):
                 raise
-            line = _describe(cause)
+            where = f" for {cause.filename}" if cause.filename else ""
+            remedy = "free some space, change permissions, or choose another folder"
+            line = f"{cause.strerror}{where}; existing files are intact; {remedy}, and try again"
         print(f"error: {line}", file=sys.stderr)
         if HydraConfig.initialized():  # remove the empty folders of a run that did not start
             folder = Path(HydraConfig.get().runtime.output_dir)
@@ -163,18 +156,6 @@ def _quieten() -> None:
         "The dirpath has changed",
     ):
         warnings.filterwarnings("ignore", message)
-
-
-def _describe(error: OSError) -> str:
-    """Return one line with the failed file access and the remedy."""
-    problem, remedy = error.strerror, "choose another folder or repair this one"
-    if error.errno in FULL:
-        problem, remedy = "no space left", "free some space"
-    elif error.errno in FORBIDDEN:
-        problem = "no permission to write"
-        remedy = "choose another folder or change its permissions"
-    where = f" for {error.filename}" if error.filename else ""
-    return f"{problem}{where}; existing files are intact: {remedy} and run the same command again"
 
 
 def extra(cfg: DictConfig, name: str) -> bool:

@@ -85,16 +85,11 @@ def check(
     rehearse: Callable[[DictConfig], Any] | None = None,
     keys: config.Keys = (),
 ) -> DictConfig | None:
-    """Compose and check every job of a command line.
+    """Compose and check every job of a command line; return a single one, None for a sweep.
 
-    Args:
-        args: Flags and overrides.
-        rehearse: Builds the objects of a job without computing. It is called for the jobs of a
-            sweep on this machine; a single job builds its objects when it runs.
-        keys: Keys of the command, see `dpl.config.validation.check`.
-
-    Returns:
-        The configuration of a single job with the node `hydra`, None for a sweep.
+    The configuration of a single job has the node `hydra`. `rehearse` builds the objects of a job
+    without computing. It is called for the jobs of a sweep on this machine; a single job builds its
+    objects when it runs. For `keys` see `dpl.config.validation.check`.
     """
     first, jobs = _jobs(args)
     if args.cfg or args.info is not None:

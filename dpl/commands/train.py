@@ -25,32 +25,26 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", "data.DataModule", "dpl.Surroga
     scene = config.build_scene(config.with_files_of_resumed(cfg))
     module = config.instantiate(cfg, "data", scene=scene)
     surrogate = config.build_surrogate(cfg, scene)
-    _check_data(surrogate, module.source)
+    is_fitted, grows = surrogate.predictor.is_closed_form, isinstance(module.source, data.Growing)
+    name = type(surrogate.net).__name__
+    if grows and not is_fitted:
+        raise config.ConfigError(
+            f"data=growing needs a model that is fitted, such as unrolled; {name} is trained by "
+            "gradient descent: set data.train to a number"
+        )
+    if is_fitted and isinstance(module.source, data.Stream):
+        raise config.ConfigError(f"data: {name} is fitted to solved loads; set data=offline")
     if resumed is not None:
-        grows = isinstance(module.source, data.Growing)
         config.check_weights(surrogate, resumed, grows=grows)
         if grows:
             with config.error_in("ckpt_path", LookupError, TypeError, ValueError):
                 module.load_state_dict(resumed["DataModule"])
     trainer = config.build_trainer(cfg)
-    if not surrogate.predictor.is_closed_form:
+    if not is_fitted:
         cli.check_trainer(trainer, cfg)
         if resumed is not None:
             config.check_callbacks(trainer, resumed)
     return scene, module, surrogate, trainer
-
-
-def _check_data(surrogate: "dpl.Surrogate", source: "data.Source") -> None:
-    """Raise a `ConfigError` if a model cannot be trained on samples of this source."""
-    name = type(surrogate.net).__name__
-    if not surrogate.predictor.is_closed_form:
-        if isinstance(source, data.Growing):
-            raise config.ConfigError(
-                f"data=growing needs a model that is fitted, such as unrolled; {name} is trained "
-                "by gradient descent: set data.train to a number"
-            )
-    elif isinstance(source, data.Stream):
-        raise config.ConfigError(f"data: {name} is fitted to solved loads; set data=offline")
 
 
 @cli.command("train", rehearse=parts)
@@ -146,8 +140,12 @@ def _evaluate(cfg: DictConfig, scene: "dpl.Scene", trainer: Any, session: Any) -
         raise training.Diverged(message + "lower optimizer.lr")
     session.finish(trainer, prediction.errors)
     if HydraConfig.get().mode != RunMode.MULTIRUN:
-        logs = any(isinstance(one, TensorBoardLogger) for one in trainer.loggers)
-        show_next_commands(folder, tensorboard=logs)
+        print(f"\nwritten to {_from_here(folder)}; next:")
+        print(f"  {_script('view')} {_run_key(folder)}      # in the browser")
+        print(f"  {_script('evaluate')} {_run_key(folder)}  # this table", flush=True)
+        if any(isinstance(one, TensorBoardLogger) for one in trainer.loggers):
+            logs = shlex.quote(_from_here(folder))
+            print(f"  {_program('tensorboard')} --logdir {logs}", flush=True)
     if cli.extra(cfg, "view"):
         from dpl import viewer
         from dpl.commands.view import serve
@@ -155,16 +153,6 @@ def _evaluate(cfg: DictConfig, scene: "dpl.Scene", trainer: Any, session: Any) -
         policy = viewer.AccessPolicy.bind("127.0.0.1", 0, [])  # any free port
         body = viewer.Body(dpl.Simulator(best))
         serve(body, policy, title=_from_here(folder), folder=folder / "view")
-
-
-def show_next_commands(folder: Path, *, tensorboard: bool) -> None:
-    """Print the folder of a run and the commands that use it."""
-    print(f"\nwritten to {_from_here(folder)}; next:")
-    print(f"  {_script('view')} {_run_key(folder)}      # in the browser")
-    print(f"  {_script('evaluate')} {_run_key(folder)}  # this table")
-    if tensorboard:
-        logs = shlex.quote(_from_here(folder))
-        print(f"  {_program('tensorboard')} --logdir {logs}", flush=True)
 
 
 def session_overrides() -> list[str]:

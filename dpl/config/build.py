@@ -44,12 +44,9 @@ CANNOT_BE_MADE = (  # errors of a call with invalid arguments
 
 
 def instantiate(cfg: DictConfig, key: str, /, **more: Any) -> Any:
-    """Return the object of a node.
+    """Return the object of the node under a key.
 
-    Args:
-        cfg: The configuration.
-        key: Key of the node.
-        **more: Arguments of the call; of a partial (`_partial_: true`), those of its call.
+    `more` are arguments of the call; of a partial (`_partial_: true`), those of its call.
     """
     require_keys(cfg, key)
     made = _made(cfg[key], key, more)
@@ -244,11 +241,8 @@ def build_trainer(cfg: DictConfig) -> "L.Trainer":
 def show_plan(scene: Scene, *parts: Any, folder: str | None = None, verbose: bool = False) -> None:
     """Print what a run computes and where it is written.
 
-    Args:
-        scene: The scene.
-        *parts: Further objects whose work is described, such as data and surrogate.
-        folder: Folder of the run.
-        verbose: List the computations that are skipped instead of counting them.
+    The work of `parts`, such as data and surrogate, is described as that of the scene is. `verbose`
+    lists the computations that are skipped instead of counting them.
     """
     described = [pair for part in (scene, *parts) for pair in getattr(part, "describe", list)()]
     if folder is not None:

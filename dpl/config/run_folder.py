@@ -29,6 +29,10 @@ from dpl.version import install
 MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
 OF_SCENE = (*SCENE, "fixed", "regions")
 PREDICTION = (*OF_SCENE, "model", "seed")  # keys of a run that `load` reads
+DAMAGED = (  # errors of a damaged checkpoint
+    *(OSError, ValueError, TypeError, LookupError),
+    *(AttributeError, RuntimeError, ArithmeticError),
+)
 HUB = "hf://"  # begins the names of runs on the Hugging Face Hub
 SHARED = ["config.yaml", "checkpoints/*.safetensors", "*.vtu", "*.npy", "*.npz", "*.safetensors"]
 
@@ -38,13 +42,8 @@ def with_copied_files(
 ) -> tuple[DictConfig, dict[str, tuple[Path, Path]]]:
     """Return a configuration that reads the files of its scene from their copies in a folder.
 
-    Args:
-        cfg: The configuration.
-        folder: Folder of the run.
-        required: Refuse files without a copy; else these are read from where they are.
-
-    Returns:
-        The configuration, and the path and the place of the copy of each file, by key.
+    The path and the place of the copy of each file, by key, are returned too. Files without a copy
+    are read from where they are, or refused if copies are `required`.
     """
     found, files = to_container(cfg), {}
     scene = {key: found[key] for key in OF_SCENE if key in found}
@@ -107,20 +106,15 @@ def load_run(
     """Return the configuration and the best surrogate of a training run.
 
     If the run has chosen its number of training loads (`data=growing`), the number of the best fit
-    replaces `data.train` in the configuration.
-
-    Args:
-        folder: Folder of the run.
-        scene: Scene of the run, if it is built already.
-        trust: Import and call objects outside this package, such as your own law, that the
-            configuration names.
-        keys: Keys of the configuration to read, at least `PREDICTION`; None for all.
+    replaces `data.train` in the configuration. `trust` allows objects outside this package, see
+    `load`. `scene` is that of the run, if it is built already. `keys` are the keys of the
+    configuration to read, at least `PREDICTION`; None for all.
     """
     config, best = files_of_run(folder)
     cfg = OmegaConf.create(checked_config(config, trust=trust, keys=keys))
     if not trust:
         cfg = with_own_data(cfg, Path(folder))
-    with usable(best):
+    with error_in(unusable := f"{best} cannot be used", *DAMAGED):
         checkpoint = checkpoints.read(best)
         if (points := checkpoint.get(checkpoints.DATA, {}).get("points")) and "data" in cfg:
             cfg.data.train = int(points[-1][0])
@@ -134,20 +128,11 @@ def load_run(
         with contextlib.nullcontext() if trust else refused:
             scene = build_scene(own)
     surrogate = build_trained(cfg, scene)
-    with usable(best):
+    with error_in(unusable, *DAMAGED):
         checkpoints.check_scene(checkpoint, scene)
         surrogate.load_state_dict(checkpoint["state_dict"])
         surrogate.eval().check_predictions()
     return cfg, surrogate
-
-
-def usable(checkpoint: str | Path) -> contextlib.AbstractContextManager[None]:
-    """Turn the errors of a damaged checkpoint into a `ConfigError` that names it."""
-    return error_in(
-        f"{checkpoint} cannot be used",
-        *(OSError, ValueError, TypeError, LookupError),
-        *(AttributeError, RuntimeError, ArithmeticError),
-    )
 
 
 def load(folder: str | Path, *, trust: bool = False) -> "inference.Simulator":

@@ -16,7 +16,7 @@ from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.solving.worker_pool import solve_loads
 from dpl.data.sources import MAX_COUNT, Source
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
-from dpl.scene import Sample, Scene, stack
+from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.memory import machine, refuse_beyond
 from dpl.system.threads import leave_cores
@@ -238,7 +238,8 @@ class ReplayBuffer:
                 order = torch.randperm(len(usable), generator=self._generator)
                 chosen = usable[order[: self.batch_size]]
                 self._uses_left -= torch.bincount(chosen, minlength=len(self._uses_left))
-                batch = stack([self._samples[place] for place in chosen.tolist()])
+                singles = (self._samples[place] for place in chosen.tolist())
+                batch = Sample(*map(torch.stack, zip(*singles, strict=True)))
                 if self.group:
                     shape = (self.batch_size,)
                     which = torch.randint(len(self.group), shape, generator=self._generator)

@@ -74,7 +74,7 @@ def compare_outputs(
 
 def relative_differences(found: Array, expected: Array) -> Array:
     """Return ||a - b|| / ||b|| of fields (B, N, D), (B,) [-]; 0 where both are zero."""
-    difference, size = (np.sqrt((x**2).sum(axis=(1, 2))) for x in (found - expected, expected))
+    difference, size = (np.linalg.norm(x, axis=(1, 2)) for x in (found - expected, expected))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(difference == 0, 0.0, difference / size)
     return np.where(np.isfinite(ratio), ratio, np.inf)

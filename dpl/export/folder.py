@@ -44,13 +44,10 @@ RANGE = (
 def write_folder(
     surrogate: TrainedSurrogate, folder: Path, *, tol: float, errors: Mapping[str, Any] | None
 ) -> None:
-    """Write all files except the report for a surrogate whose graph lies in the folder.
+    """Write all files except the report for a surrogate whose model.onnx lies in the folder.
 
-    Args:
-        surrogate: The surrogate.
-        folder: The folder, with model.onnx.
-        tol: Largest relative difference of ONNX and torch [-].
-        errors: Errors on the test set, see `dpl.training.metrics`, if the run was evaluated.
+    `tol` is the largest relative difference of ONNX and torch [-]. `errors` are those on the test
+    set, see `dpl.training.metrics`, if the run was evaluated.
     """
     scene, loads = surrogate.scene, surrogate.scene.loads
     (folder / "reference").mkdir(parents=True, exist_ok=True)
@@ -178,12 +175,9 @@ def _solve_reference(
 ) -> tuple[dict[str, Array], dict[str, Any]]:
     """Return the first random load for which Newton converges, and its entry in meta.json.
 
-    Of `max_loads` loads the last one is taken in any case.
-
-    Returns:
-        Arrays by file name: the inputs of the graph with B = 1, `displacement` of the surrogate
-        and `fe_displacement`, (1, N, D) [m]. The entry has the shapes of the arrays, the relative
-        residuals of both displacements, `fe_converged`, and their relative difference `error` [-].
+    Of `max_loads` loads the last one is taken in any case. The arrays, by file name, are the inputs
+    of the graph with B = 1 and both displacements, (1, N, D) [m]. Residuals and `error`, the
+    difference of the displacements, are relative [-].
     """
     scene = surrogate.scene
     for k in range(max_loads):

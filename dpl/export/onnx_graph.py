@@ -32,14 +32,8 @@ def export_onnx(surrogate: TrainedSurrogate, path: Path) -> None:
     """Write a surrogate as an ONNX file, and weights above 2 GB as `<path>.data`.
 
     The inputs are those of `Scene.si_inputs`, the output is `displacement`, (B, N, D) [m]. Older
-    files are replaced.
-
-    Args:
-        surrogate: The surrogate, on the CPU.
-        path: The file.
-
-    Raises:
-        ValueError: The network has control flow that depends on values, or a fixed batch size.
+    files are replaced. The surrogate is on the CPU. A network with a fixed batch size, or control
+    flow that depends on values, is a ValueError.
     """
     import onnx
 
@@ -87,12 +81,7 @@ def _silence_exporter() -> Iterator[None]:
 
 
 class OnnxSession:
-    """ONNX file, evaluated by onnxruntime on one thread.
-
-    Attributes:
-        inputs: Names of the inputs, in order.
-        outputs: Names of the outputs, in order.
-    """
+    """ONNX file, evaluated by onnxruntime on one thread; `inputs` are the names of its inputs."""
 
     def __init__(self, path: Path) -> None:
         """Load an ONNX file."""
@@ -104,7 +93,6 @@ class OnnxSession:
             str(path), options, providers=["CPUExecutionProvider"]
         )
         self.inputs = [one.name for one in self._session.get_inputs()]
-        self.outputs = [one.name for one in self._session.get_outputs()]
 
     def __call__(self, **inputs: Array | Tensor) -> Array:
         """Return displacements (B, N, D) [m] of the inputs of the graph, by name."""

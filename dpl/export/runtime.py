@@ -63,12 +63,8 @@ Arrays = dict[str, NDArray[Any]]
 def write_runtime(folder: Path, surrogate: TrainedSurrogate) -> Path:
     """Write `runtime.safetensors` and copy the C++ sources that read it; return its path.
 
-    Args:
-        folder: Folder to write to; created if it does not exist.
-        surrogate: A surrogate with a fitted `Unrolled` model.
-
-    Raises:
-        ValueError: The header cannot simulate this body or model.
+    The folder is created if it does not exist. A body that the header cannot simulate, or another
+    model than a fitted `Unrolled`, is a ValueError.
     """
     net, scene = surrogate.net, surrogate.scene
     law = _checked_law(net, scene)
@@ -127,7 +123,7 @@ def _model(net: Unrolled) -> Arrays:
     orbits, own = arrays.orbits, arrays._asdict()
     del own["orbits"]
     law, inverse, _ = net._at(torch.zeros(1, 0))
-    (table, unknowns, _), values = linear.blocks
+    table, unknowns, _, values = linear.blocks
     factors = np.append(linear.terms.factors(net.scene.problem.material)[0].numpy(), 1.0)
     return {
         **orbits._asdict(),

@@ -24,11 +24,6 @@ def write_pairs(scene: Scene, splits: Mapping[str, Sample], folder: Path) -> Pat
     The arrays have one row for each load: `force` and `displacement` (S, N, D), `young` (S,),
     `parameters` (S, P) and `split`, the number of the split among `splits`. `points` are the nodes
     (N, D). `data=files` reads the file.
-
-    Args:
-        scene: Scene of the samples.
-        splits: Samples by split.
-        folder: Folder, which is created.
     """
     folder.mkdir(parents=True, exist_ok=True)
     body = scene.problem
@@ -69,16 +64,9 @@ def write_published(
 ) -> Path:
     """Write what `dpl.load` needs of a run, with a card for a model hub; return the card.
 
-    Args:
-        scene: Scene of the run.
-        folder: Folder, which must be empty or new.
-        config: The configuration of the prediction.
-        files: Files of the scene in the folder of the run.
-        run: Folder of the run, with weights in the format safetensors.
-        license: Identifier of the licence (SPDX).
-
-    Raises:
-        ValueError: The folder is not empty, or the run has no weights in this format.
+    `config` is the configuration of the prediction, `files` are those of the scene in the folder
+    `run`, `license` is the SPDX identifier. A folder that is not empty, and a run without weights
+    in the format safetensors, are ValueErrors.
     """
     weights = run / "checkpoints" / "best.safetensors"
     if not weights.is_file():

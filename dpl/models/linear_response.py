@@ -164,7 +164,7 @@ class LinearResponse:
         if not self.terms.varies:
             return partial(_solutions, self.blocks)
         shape, dtype = self.orbits.dofs.shape, self.blocks.values.dtype
-        matrix, ends = self._matrices.at(factors), (self.terms.rtol, self.terms.max_steps)
+        matrix, ends = self._matrices.at(factors), (self.terms.rtol, 2 * self.terms.bound)
 
         def precondition(residual: Array) -> Array:
             return _solutions(self.blocks, residual.reshape(shape)).astype(np.float64).ravel()
@@ -245,7 +245,7 @@ class LinearResponse:
         def product(x: Tensor) -> Tensor:
             return (matrix * x[:, columns]).sum(dim=-1)
 
-        ends = self.terms.rtol, self.terms.max_steps
+        ends = self.terms.rtol, 2 * self.terms.bound
         return conjugate_gradients_of_tensors(product, of_node, right, *ends)
 
     def _orbits(self, device: torch.device) -> list[Tensor]:
@@ -310,7 +310,7 @@ def _largest(right: Tensor) -> Tensor:
 
 def _solutions(blocks: Condensed, forces: Parts) -> Parts:
     """Return the solutions of forces, (M, m) each, in the type of the blocks."""
-    (table, unknowns, _), values = blocks
+    table, unknowns, _, values = blocks
     solutions = np.empty(forces.shape, values.dtype)
     condensed_solves(table, unknowns, values, forces.astype(values.dtype), solutions)
     return solutions

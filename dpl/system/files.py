@@ -52,14 +52,9 @@ def atomic_write(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
 
 
 def write_file(path: Path, content: bytes, *, sync: bool = True) -> None:
-    """Write a file of a data set atomically, see `atomic_write`; refuse to replace a folder."""
-    try:
-        with atomic_write(path, sync=sync) as file:
-            file.write(content)
-    except IsADirectoryError:
-        raise DataSetError(
-            f"{path} must be a file, but is a folder; remove it or choose another data.folder"
-        ) from None
+    """Write a file of a data set atomically, see `atomic_write`."""
+    with atomic_write(path, sync=sync) as file:
+        file.write(content)
 
 
 def sync_folder(path: Path) -> None:
@@ -75,18 +70,13 @@ def append_jsonl(path: Path, line: dict[str, Any]) -> None:
     """Append a line of JSON to a regular file and sync it; terminate an incomplete line first."""
     with suppress(FileNotFoundError):
         _check_regular_file(path, MAX_TEXT_SIZE)
-    with path.open("ab+", buffering=0) as file:
+    with path.open("ab+") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - 1))
         incomplete = size > 0 and file.read(1) != b"\n"
-        left = b"\n" * incomplete + json.dumps(line).encode() + b"\n"
-        try:
-            while left:
-                left = left[file.write(left) :]
-            os.fsync(file.fileno())
-        except OSError:  # no space left: remove the part of the line that was written
-            os.ftruncate(file.fileno(), size)
-            raise
+        file.write(b"\n" * incomplete + json.dumps(line).encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def read_regular_file(path: Path, most: float = MAX_TEXT_SIZE) -> bytes:
@@ -113,42 +103,35 @@ def read_array(path: Path, row: tuple[int, ...], name: str | None = None) -> NDA
     """Return the array in a .npy file, or one in a .npz file, (S, *row) with S > 0.
 
     The kind and the size of the file, and type and shape in the header of the array, are checked
-    before the array is read.
-
-    Args:
-        path: The file.
-        row: Shape of a row; -1 for any number.
-        name: Name of the array in a .npz file with several.
+    before the array is read. A -1 in `row` stands for any number. `name` is that of the array in a
+    .npz file with several.
     """
     if path.suffix not in (".npy", ".npz"):
         raise ValueError("the file must be .npy or .npz")
-    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
-        status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise ValueError("the file is a pipe or a device and must be a regular file")
-        if status.st_size > MAX_ARRAY_SIZE:
-            raise ValueError(f"the file must have at most {MAX_ARRAY_SIZE:,} bytes")
-        try:
-            if path.suffix == ".npy":
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError("the file is a directory, a pipe or a device and must be a regular file")
+    if status.st_size > MAX_ARRAY_SIZE:
+        raise ValueError(f"the file must have at most {MAX_ARRAY_SIZE:,} bytes")
+    try:
+        if path.suffix == ".npy":
+            with path.open("rb") as file:
                 return _read_npy(file, status.st_size, row)
-            with zipfile.ZipFile(file) as archive:
-                members = archive.infolist()
-                if len(members) != 1 and name is not None:
-                    members = [one for one in members if one.filename == f"{name}.npy"]
-                if len(members) != 1:
-                    which = "one array" if name is None else f"an array {name!r}"
-                    raise ValueError(
-                        f"the file must contain {which} and has {len(archive.infolist())}: "
-                        f"{', '.join(array_names(path)) or 'none'}"
-                    )
-                if members[0].compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                    raise ValueError("the file must be written by numpy.savez")
-                with archive.open(members[0]) as member:
-                    return _read_npy(member, members[0].file_size, row)
-        except (OSError, ValueError):
-            raise
-        except Exception as error:  # of zipfile, zlib, or the parser of the header
-            raise ValueError(f"the file is damaged: {' '.join(str(error).split())}") from error
+        with zipfile.ZipFile(path) as archive:
+            every = archive.infolist()
+            members = [one for one in every if len(every) == 1 or one.filename == f"{name}.npy"]
+            if len(members) != 1:
+                which = "one array" if name is None else f"an array {name!r}"
+                names = ", ".join(array_names(path)) or "none"
+                raise ValueError(f"the file must contain {which} and has {len(every)}: {names}")
+            if members[0].compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError("the file must be written by numpy.savez")
+            with archive.open(members[0]) as member:
+                return _read_npy(member, members[0].file_size, row)
+    except (OSError, ValueError):
+        raise
+    except Exception as error:  # of zipfile, zlib, or the parser of the header
+        raise ValueError(f"the file is damaged: {' '.join(str(error).split())}") from error
 
 
 def array_names(path: Path) -> list[str]:

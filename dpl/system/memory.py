@@ -41,16 +41,12 @@ def refuse_mesh(nodes: int, key: str) -> None:
     """Raise an error if K(0) of a mesh exceeds the memory, or its nodes those of `at_most`."""
     most, reason = _MOST.get() or (nodes, "")
     if nodes > most:
-        raise ValueError(f"{key} = {_count(nodes)} nodes must be {_count(most)} at most; {reason}")
-    refuse_beyond(nodes * NODE_SIZE / 1e9, machine(), f"{_count(nodes)} nodes", f"take fewer {key}")
+        raise ValueError(f"{key} = {nodes:,} nodes must be {most:,} at most; {reason}")
+    refuse_beyond(nodes * NODE_SIZE / 1e9, machine(), f"{nodes:,} nodes", f"take fewer {key}")
 
 
 def refuse_weights(parameters: int, limit: float | None, remedy: str) -> None:
     """Raise MemoryError if training this many float32 parameters exceeds the memory."""
     needed = parameters * 4 * 4 / 1e9  # parameters, gradients, two moments, 4 bytes each
-    what = f"{_count(parameters)} parameters with gradients and Adam's moments"
+    what = f"{parameters:,} parameters with gradients and Adam's moments"
     refuse_beyond(needed, limit, what, remedy)
-
-
-def _count(number: int) -> str:
-    return f"{number:,}" if number < 10**15 else f"{number:.1e}"

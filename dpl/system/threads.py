@@ -22,8 +22,7 @@ T = TypeVar("T")
 
 def available_cores() -> int:
     """Return the number of cores that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
+    return len(os.sched_getaffinity(0))
 
 
 def leave_cores(workers: int) -> None:

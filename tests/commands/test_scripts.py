@@ -206,7 +206,7 @@ def test_a_killed_worker_is_replaced_and_training_goes_on(streaming, members, tm
 def test_a_killed_parent_leaves_no_process(streaming, members):
     process, _ = streaming
     process.kill()
-    assert waited_for(lambda: not members(process.pid), 2)
+    assert waited_for(lambda: not members(process.pid))
 
 
 # ------------------------------------------------------------------ sweeps

@@ -296,7 +296,7 @@ def test_a_limit_of_the_file_size_ends_with_one_line_and_a_resume_makes_the_same
     before = content(tmp_path / "d")
     status, _, err = limited(f"ulimit -f {blocks}; GENERATE", *slow(workers=workers), cwd=tmp_path)
     assert status == 2, err[-2000:]
-    assert err.startswith("error: no space left")
+    assert err.startswith("error: File too large")
     assert err.count("\n") == 1
     assert {**content(tmp_path / "d"), **before} == content(tmp_path / "d")
     assert leftovers(tmp_path / "d") == []

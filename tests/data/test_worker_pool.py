@@ -121,8 +121,6 @@ def test_a_pool_has_no_more_workers_than_loads_and_leaves_none_when_closed(scene
     first = next(running)
     members = children() - before
     assert len(members) == 1
-    (command,) = [Path(f"/proc/{pid}/cmdline").read_text() for pid in members]
-    assert "die_with_parent" in command
     running.close()
     assert content(first) == here[first.job.number]
     assert not any(Path(f"/proc/{pid}").exists() for pid in members)

@@ -217,7 +217,7 @@ def test_a_folder_describes_its_surrogate(write_export, name):
     assert np.array_equal(held.reshape(problem.shape), ~problem.free.numpy())
     session, model = OnnxSession(folder / "model.onnx"), found["model"]
     assert [one["name"] for one in model["inputs"]] == session.inputs
-    assert [one["name"] for one in model["outputs"]] == session.outputs == ["displacement"]
+    assert [one["name"] for one in model["outputs"]] == ["displacement"]
 
 
 def test_the_reference_has_the_displacements_of_surrogate_and_finite_elements(write_export):

@@ -72,7 +72,7 @@ def test_all_solutions_equal_those_of_a_dense_factorisation(graph):
     right = torch.from_numpy(random.T.copy()).expand(2, -1, -1)
     for k, many in enumerate(solve_layers(condensed_layers(blocks, "cpu"), right).numpy()):
         assert norm((1 + k) * many.T - exact) < 1e-11 * norm(exact)
-    table, unknowns, _ = blocks.fronts
+    table, unknowns, *_ = blocks
     for dtype, most in ((np.float64, 1e-11), (np.float32, 1e-5)):
         values = blocks.values.astype(dtype)
         for right, expected in zip([*random.T, np.zeros(size)], [*exact.T, 0.0], strict=True):

@@ -108,7 +108,7 @@ def test_the_error_of_every_force_and_parameter_is_small_after_at_most_the_steps
         point[random.integers(len(point))] = 1.0
         for force in (point, random.standard_normal(len(matrix))):
             exact = np.linalg.solve(matrix, force)
-            ends = terms.rtol, terms.max_steps
+            ends = terms.rtol, 2 * terms.bound
             found = conjugate_gradients(matrix.dot, near.dot, force, *ends, natural=True)
             error = found - exact
             assert error @ matrix @ error < MAX_ERROR**2 * (exact @ matrix @ exact)

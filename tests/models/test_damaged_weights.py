@@ -8,7 +8,8 @@ from safetensors.torch import load, save
 
 from benchmarks.samples import solved
 from dpl.config import ConfigError
-from dpl.config.run_folder import usable
+from dpl.config.plain import error_in
+from dpl.config.run_folder import DAMAGED
 from dpl.inference import Simulator
 from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
 from dpl.training import MSE, Surrogate
@@ -79,7 +80,7 @@ def test_damaged_weights_are_refused_or_give_honest_answers(surrogate, scene, se
     refusals, answers = [], 0
     for name, state in damaged_states(surrogate):
         try:
-            with usable("weights"):
+            with error_in("weights", *DAMAGED):
                 surrogate.load_state_dict(state)
                 surrogate.check_predictions()
         except ConfigError as refusal:

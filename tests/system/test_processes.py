@@ -9,36 +9,35 @@ from contextlib import suppress
 
 import pytest
 
-from dpl.system.processes import spawn_context
-
 LONG = 120  # limit for an event; reached only if a process is left behind [s]
 
 # Parent and worker hold the standard output, which therefore closes when both have ended. A worker
-# first imports the main module, where it waits without end.
+# imports the main module before it calls its task.
 PROGRAM = textwrap.dedent(
     """
     import os
     import signal
     import threading
+    import time
 
-    if __name__ == "__mp_main__":
-        print("importing", flush=True)
-        threading.Event().wait()
+    from dpl.system.processes import die_with_parent, spawn_context
+
+    parent = int(os.environ.setdefault("PARENT", str(os.getpid())))
+    while __name__ == "__mp_main__" and {dies_first} and os.getppid() == parent:
+        time.sleep(0.01)
 
     def task():
+        die_with_parent()
         print("at work", flush=True)
+        threading.Event().wait()
 
     if __name__ == "__main__":
-        from dpl.system.processes import spawn_context
-        worker = spawn_context().Process(target=task, daemon=True)
-        worker.start()
-        {then}
+        spawn_context().Process(target=task, daemon=True).start()
+        if {dies_first}:
+            os.kill(os.getpid(), signal.SIGKILL)
+        threading.Event().wait()
     """
 )
-MOMENTS = {
-    "at once": "os.kill(os.getpid(), signal.SIGKILL)",
-    "while it imports": "print('started', flush=True); threading.Event().wait()",
-}
 
 
 @pytest.fixture
@@ -68,29 +67,12 @@ def launched(tmp_path, environment):
 
 
 @pytest.mark.timeout(3 * LONG)
-@pytest.mark.parametrize("moment", MOMENTS)
-def test_a_worker_that_is_still_importing_ends_with_its_parent(launched, moment):
-    parent = launched(PROGRAM.format(then=MOMENTS[moment]))
-    if moment == "while it imports":
-        lines = {parent.stdout.readline() for _ in range(2)}
-        assert lines == {"started\n", "importing\n"}
+@pytest.mark.parametrize("dies_first", [False, True], ids=["at work", "importing"])
+def test_a_worker_ends_with_its_parent(launched, dies_first):
+    parent = launched(PROGRAM.format(dies_first=dies_first))
+    if not dies_first:
+        assert parent.stdout.readline() == "at work\n"
         parent.kill()
     out, _ = parent.communicate(timeout=LONG)  # which waits for the worker's output to end
     assert parent.returncode == -signal.SIGKILL
-    assert "at work" not in out
-
-
-def test_a_worker_returns_its_exit_status_and_leaves_other_starts_unchanged():
-    from multiprocessing import spawn
-
-    before = spawn.get_command_line
-    context = spawn_context()
-    workers = [context.Process(target=sys.exit, args=(status,)) for status in (0, 3)]
-    for worker in workers:
-        worker.start()
-    assert {worker.pid for worker in workers}.isdisjoint({os.getpid()})
-    for worker in workers:
-        worker.join()
-    assert [worker.exitcode for worker in workers] == [0, 3]
-    assert spawn.get_command_line is before
-    assert context.get_start_method() == "spawn"
+    assert out == ""

@@ -231,7 +231,7 @@ def test_a_full_disk_ends_training_with_one_line_and_intact_files(forked, home, 
     status, err = forked(partial(limiting, name, most), run)
     assert status == 2, err[-2000:]
     line = err.strip().splitlines()[-1]
-    assert line.startswith("error: no space left"), line
+    assert line.startswith("error: File too large"), line
     assert "Traceback" not in err
     assert last(home / run)["epoch"] == 1, "the checkpoint before is whole"
     assert read(home / run / "checkpoints/best.safetensors")["epoch"] <= 2

@@ -3,7 +3,7 @@
 - A worker that dies is replaced, and its load is tried again.
 - A worker that exceeds the time limit is replaced, and its load is recorded as failed.
 - After the first SIGINT or SIGTERM the solves in progress are finished; the second one aborts them.
-- No worker outlives this process.
+- No worker outlives this process, except until the end of its imports.
 """
 
 import atexit
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from dpl.data.solving.solve import Guess, LoadKey, SolvedLoad, failed_load, guessed, solve_load
 from dpl.scene import Scene
-from dpl.system.processes import block_signals, spawn_context
+from dpl.system.processes import block_signals, die_with_parent, spawn_context
 
 MAX_RETRIES = 3  # tries of a load whose worker dies
 MAX_CONSECUTIVE_CRASHES = 12  # without a solved load in between; the loads are not the cause
@@ -205,7 +205,8 @@ def _wait(workers: list[_Worker]) -> tuple[list[SolvedLoad], list[LoadKey], list
 
 
 def _work(pipe: Connection, scene: Scene) -> None:
-    """Solve the loads that are received until the pipe closes."""
+    """Solve the loads that are received until the pipe closes or the parent process ends."""
+    die_with_parent()
     for number in (signal.SIGINT, signal.SIGTERM):  # libraries may have unblocked them
         signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):

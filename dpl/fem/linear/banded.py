@@ -63,27 +63,25 @@ class BandedFactor(Factor):
     """Banded Cholesky factor L of a positive definite matrix."""
 
     storage: NDArray[Any]  # L, (n, b + 1), see `BandStorage`
-    order: NDArray[np.int32] | None  # order of the unknowns, see `BandStorage`
+    order: NDArray[np.int32]  # order of the unknowns, see `BandStorage`
     negative_pivots: int = 0
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), to the rounding of the storage, see `Factor.solve`."""
-        order = slice(None) if self.order is None else self.order
-        ordered = np.ascontiguousarray(right[order], self.storage.dtype)
+        ordered = np.ascontiguousarray(right[self.order], self.storage.dtype)
         solve = dpbtrs if self.storage.dtype == np.float64 else spbtrs
         x = np.empty_like(right)
-        x[order] = solve(self.storage.T, ordered, lower=1)[0].ravel()
+        x[self.order] = solve(self.storage.T, ordered, lower=1)[0].ravel()
         return x
 
     def solve_many(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return the solutions, (k, n), to the rounding of the storage, see `Factor.solve_many`."""
         size = np.abs(right).max(axis=1, keepdims=True, initial=0)
         size[size == 0] = 1
-        order = slice(None) if self.order is None else self.order
-        ordered = np.ascontiguousarray((right / size)[:, order].T, self.storage.dtype)
+        ordered = np.ascontiguousarray((right / size)[:, self.order].T, self.storage.dtype)
         banded_block_solve(self.storage, ordered)
         x = np.empty_like(right)
-        x[:, order] = ordered.T
+        x[:, self.order] = ordered.T
         return x * size
 
 

@@ -37,41 +37,16 @@ SMALLEST_SIDE = 0.05  # of the unknowns of a part
 SAME = 1e-9  # difference of coordinates, over the size of the body, of one layer
 
 
-class Front(NamedTuple):
-    """Unknowns that are eliminated together, ascending.
-
-    The boundary are unknowns that are eliminated later and are coupled to the pivots, directly or
-    by earlier eliminations.
-    """
-
-    pivots: Integers  # the eliminated unknowns, (I,)
-    boundary: Integers  # (J,)
-    children: tuple[int, ...]  # numbers of the fronts whose boundaries begin here
-
-
-def nested_dissection(graph: csr_array, points: NDArray[np.float64]) -> list[Front]:
-    """Return the fronts of a matrix, children before their parents.
-
-    The graph is a symmetric matrix with positive entries where unknowns are coupled, (n, n). The
-    points (n, D) are the positions of the unknowns.
-    """
-    fronts: list[Front] = []
-    _dissect(graph, points, np.arange(graph.shape[0]), fronts)
-    pivots = np.concatenate([front.pivots for front in fronts])
-    rank = np.empty_like(pivots)
-    rank[pivots] = np.arange(len(pivots))
-    for k, front in enumerate(fronts):
-        later = [fronts[child].boundary for child in front.children]
-        coupled = np.unique(np.concatenate([graph[front.pivots].indices, *later]))
-        boundary = coupled[rank[coupled] > rank[front.pivots].max()]
-        fronts[k] = front._replace(boundary=boundary.astype(np.int64))
-    return fronts
-
-
 def _dissect(
-    graph: csr_array, points: NDArray[np.float64], unknowns: Integers, fronts: list[Front]
+    graph: csr_array,
+    points: NDArray[np.float64],
+    unknowns: Integers,
+    fronts: list[tuple[Integers, tuple[int, ...]]],
 ) -> tuple[int, ...]:
-    """Append the fronts of some unknowns and return the numbers of the last ones, the roots."""
+    """Append pivots and children of the fronts of some unknowns; return the numbers of the roots.
+
+    Pivots are ascending. The boundaries of the children begin in their front.
+    """
     if not len(unknowns):
         return ()
     own = graph[unknowns][:, unknowns]
@@ -85,7 +60,7 @@ def _dissect(
         for k in (-1, 1):
             children += _dissect(graph, points, unknowns[side == k], fronts)
         unknowns = unknowns[side == 0]
-    fronts.append(Front(unknowns, unknowns[:0], children))
+    fronts.append((unknowns, children))
     return (len(fronts) - 1,)
 
 
@@ -111,8 +86,8 @@ def _divide(graph: csr_array, points: NDArray[np.float64]) -> NDArray[np.int8] |
     return best
 
 
-class Fronts(NamedTuple):
-    """Fronts of a matrix, children before their parents, as arrays.
+class Condensed(NamedTuple):
+    """Blocks of P matrices with the same fronts, children before their parents.
 
     A row of the table has the first and last position of the pivots among the unknowns, the last
     position of the boundary, and the position of the blocks among the values.
@@ -121,53 +96,51 @@ class Fronts(NamedTuple):
     table: Integers  # (S, 4)
     unknowns: Integers  # pivots and boundary of one front after the other, (T,)
     heights: Integers  # 0 without children, else one more than the largest of theirs, (S,)
-
-
-class Condensed(NamedTuple):
-    """Blocks of P matrices with the same fronts."""
-
-    fronts: Fronts  # the fronts
     values: NDArray[Any]  # F_II^-1 and X of one front after the other, row by row, (P, V)
 
 
 def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Condensed:
-    """Return the blocks in float64 of P symmetric positive definite matrices, (n, n).
+    """Return the blocks in float64 of P symmetric matrices, (n, n), of a similar structure.
 
-    The matrices have a similar structure. The fronts are chosen by the points, (n, D), the
-    positions of the unknowns.
-
-    Raises:
-        SingularMatrix: A matrix is not positive definite.
+    The fronts are chosen by the points, (n, D), the positions of the unknowns. A matrix that is not
+    positive definite raises a `SingularMatrix`.
     """
     graph = csr_array(sum(abs(matrix) for matrix in matrices))
-    tree = nested_dissection(graph, points)
-    updates: dict[int, NDArray[np.float64]] = {}
-    table, heights, blocks = [], np.zeros(len(tree), np.int64), []
+    tree: list[tuple[Integers, tuple[int, ...]]] = []
+    _dissect(graph, points, np.arange(graph.shape[0]), tree)
+    rank, position = np.empty((2, graph.shape[0]), np.int64)
+    rank[np.concatenate([pivots for pivots, _ in tree])] = np.arange(len(rank))
+    updates: dict[int, tuple[Integers, NDArray[np.float64]]] = {}  # boundaries and F there
+    table, heights, unknowns, blocks = [], np.zeros(len(tree), np.int64), [], []
     first = place = 0
-    for k, front in enumerate(tree):
-        both, count = np.concatenate([front.pivots, front.boundary]), len(front.pivots)
+    for k, (pivots, children) in enumerate(tree):
+        passed = [updates.pop(child) for child in children]
+        coupled = np.concatenate([graph[pivots].indices, *(boundary for boundary, _ in passed)])
+        coupled = np.unique(coupled).astype(np.int64)
+        boundary = coupled[rank[coupled] > rank[pivots].max()]
+        both, count = np.concatenate([pivots, boundary]), len(pivots)
         F = np.zeros((len(matrices), len(both), len(both)))
         for own, matrix in zip(F, matrices, strict=True):
-            own[:count] = matrix[front.pivots][:, both].toarray()
+            own[:count] = matrix[pivots][:, both].toarray()
         F[:, count:, :count] = F[:, :count, count:].mT
-        position = dict(zip(both.tolist(), range(len(both)), strict=True))
-        for child in front.children:
-            where = np.array([position[j] for j in tree[child].boundary.tolist()], np.int64)
-            F[:, where[:, None], where] += updates.pop(child)
-            heights[k] = max(heights[k], heights[child] + 1)
+        position[both] = np.arange(len(both))
+        for inner, update in passed:
+            where = position[inner]
+            F[:, where[:, None], where] += update
+        heights[k] = max((heights[child] + 1 for child in children), default=0)
         try:
             roots = np.linalg.inv(np.linalg.cholesky(F[:, :count, :count]))
         except np.linalg.LinAlgError as error:
             raise SingularMatrix("the matrix is not positive definite") from error
         inverse = roots.mT @ roots  # exactly symmetric
         X = inverse @ F[:, :count, count:]
-        updates[k] = F[:, count:, count:] - F[:, count:, :count] @ X
+        updates[k] = boundary, F[:, count:, count:] - F[:, count:, :count] @ X
         table.append((first, first + count, first + len(both), place))
         first, place = first + len(both), place + count * len(both)
+        unknowns.append(both)
         blocks += [inverse.reshape(len(F), -1), X.reshape(len(F), -1)]
-    unknowns = np.concatenate([part for front in tree for part in front[:2]])
-    fronts = Fronts(np.array(table), unknowns, heights)
-    return Condensed(fronts, np.concatenate(blocks, axis=1))
+    arrays = np.array(table), np.concatenate(unknowns), heights
+    return Condensed(*arrays, np.concatenate(blocks, axis=1))
 
 
 @njit(fastmath=True)
@@ -213,42 +186,12 @@ def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit
-def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[no-untyped-def]
-    """Set `solution` (n,) to that of one matrix, see `condensed_solves`."""
-    work, dtype = np.zeros_like(force), force.dtype
-    for s in range(len(table)):
-        first, middle, last, place = table[s]
-        pivots, boundary = unknowns[first:middle], unknowns[middle:last]
-        count, others = len(pivots), len(boundary)
-        square = count * count
-        own, is_loaded = np.empty(count, dtype), False
-        for i in range(count):
-            own[i] = force[pivots[i]]
-            is_loaded = is_loaded or own[i] != 0.0
-        inner, passed = np.zeros(count, dtype), work[:others]
-        if is_loaded:
-            passed[:] = 0.0
-            add_product(own, values[place : place + square].reshape((count, count)), inner)
-            X = values[place + square : place + square + count * others]
-            add_product(own, X.reshape((count, others)), passed)
-            for j in range(others):
-                force[boundary[j]] -= passed[j]
-        for i in range(count):
-            solution[pivots[i]] = inner[i]
-    for s in range(len(table) - 1, -1, -1):
-        first, middle, last, place = table[s]
-        pivots, boundary = unknowns[first:middle], unknowns[middle:last]
-        count, others = len(pivots), len(boundary)
-        start, outer = place + count * count, work[:others]
-        for j in range(others):
-            outer[j] = solution[boundary[j]]
-        own = np.empty(count, dtype)
-        for i in range(count):
-            own[i] = solution[pivots[i]]
-        X = values[start : start + count * others].reshape((count, others))
-        subtract_product(X, outer, own)
-        for i in range(count):
-            solution[pivots[i]] = own[i]
+def take(x, places):  # type: ignore[no-untyped-def]
+    """Return x[places], which numba computes more slowly with checks of the places."""
+    found = np.empty(len(places), x.dtype)
+    for i in range(len(places)):
+        found[i] = x[places[i]]
+    return found
 
 
 @njit(
@@ -263,14 +206,36 @@ def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[n
 def condensed_solves(table, unknowns, values, forces, solutions):  # type: ignore[no-untyped-def]
     """Set `solutions` (P, n) to those of P matrices, one force (P, n) each, of the same type.
 
-    The forces are in float64 or in the type of the blocks and are overwritten. For table, unknowns
-    and values, (P, V), see `Fronts` and `Condensed`.
+    The forces are in float64 or in the type of the blocks and are overwritten. See `Condensed` for
+    table, unknowns and values, (P, V).
     """
     for p in range(len(values)):
-        if (forces[p] != 0.0).any():
-            condensed_solve(table, unknowns, values[p], forces[p], solutions[p])
-        else:
-            solutions[p] = 0.0
+        force, solution = forces[p], solutions[p]
+        if not force.any():
+            solution[:] = 0.0
+            continue
+        for s in range(len(table)):
+            first, middle, last, place = table[s]
+            pivots, boundary = unknowns[first:middle], unknowns[middle:last]
+            own, count = take(force, pivots), len(pivots)
+            inner, start = np.zeros_like(own), place + count * count
+            if own.any():
+                add_product(own, values[p, place:start].reshape((count, count)), inner)
+                passed = np.zeros(len(boundary), own.dtype)
+                X = values[p, start : start + count * len(boundary)]
+                add_product(own, X.reshape((count, len(boundary))), passed)
+                for j in range(len(boundary)):
+                    force[boundary[j]] -= passed[j]
+            for i in range(count):
+                solution[pivots[i]] = inner[i]
+        for s in range(len(table) - 1, -1, -1):
+            first, middle, last, place = table[s]
+            pivots, boundary = unknowns[first:middle], unknowns[middle:last]
+            own, count = take(solution, pivots), len(pivots)
+            X = values[p, place + count * count : place + count * (count + len(boundary))]
+            subtract_product(X.reshape((count, len(boundary))), take(solution, boundary), own)
+            for i in range(count):
+                solution[pivots[i]] = own[i]
 
 
 class Layer(NamedTuple):
@@ -284,11 +249,26 @@ class Layer(NamedTuple):
 
 def condensed_layers(blocks: Condensed, device: torch.device | str) -> list[Layer]:
     """Return the blocks on a device, in their dtype, fronts without children first."""
-    table, _, heights = blocks.fronts
-    classes = np.rint(2 * np.log2(table[:, 1] - table[:, 0]))  # similar numbers of pivots
-    kinds = sorted(set(zip(heights.tolist(), classes.tolist(), strict=True)))
-    chosen = (np.flatnonzero((heights == h) & (classes == c)) for h, c in kinds)
-    return [Layer(*(part.to(device) for part in _layer(blocks, fronts))) for fronts in chosen]
+    table, unknowns, heights, values = blocks
+    size, widths = len(np.unique(unknowns)), np.diff(table[:, :3])  # numbers of pivots, boundary
+    kinds = np.stack([heights, np.rint(2 * np.log2(widths[:, 0])).astype(int)], axis=1)
+    layers = []
+    for kind in np.unique(kinds, axis=0):  # one height, similar numbers of pivots
+        chosen = np.flatnonzero((kinds == kind).all(axis=1))
+        count, others = np.maximum(widths[chosen].max(axis=0), 1)  # graphs have no empty tensors
+        pivots, boundary = (np.full((len(chosen), width), size) for width in (count, others))
+        inverse = np.zeros((len(values), len(chosen), count, count), values.dtype)
+        coupling = np.zeros((len(values), len(chosen), count, others), values.dtype)
+        for k, (first, middle, last, place) in enumerate(table[chosen].tolist()):
+            own, other = middle - first, last - middle
+            pivots[k, :own], boundary[k, :other] = unknowns[first:middle], unknowns[middle:last]
+            block = values[:, place : place + own * (own + other)]
+            square, rest = np.split(block, [own * own], axis=1)
+            inverse[:, k, :own, :own] = square.reshape(len(values), own, own)
+            coupling[:, k, :own, :other] = rest.reshape(len(values), own, other)
+        arrays = pivots, boundary, inverse, coupling
+        layers.append(Layer(*(torch.from_numpy(array).to(device) for array in arrays)))
+    return layers
 
 
 def solve_layers(layers: Sequence[Layer], right: Tensor) -> Tensor:
@@ -309,22 +289,3 @@ def solve_layers(layers: Sequence[Layer], right: Tensor) -> Tensor:
         found = (own - outer @ layer.coupling.transpose(2, 3)).transpose(1, 2).flatten(2)
         solution = solution.index_add(2, layer.pivots.flatten(), found)
     return solution[..., :-1]
-
-
-def _layer(blocks: Condensed, numbers: Integers) -> Layer:
-    """Return some fronts, by their numbers."""
-    (table, unknowns, _), values = blocks
-    size, ends = len(np.unique(unknowns)), table[numbers]
-    count = int((ends[:, 1] - ends[:, 0]).max())
-    others = max(1, int((ends[:, 2] - ends[:, 1]).max()))  # graphs have no empty tensors
-    shape = len(numbers), count, others
-    pivots, boundary = np.full(shape[:2], size), np.full((len(numbers), others), size)
-    inverse = np.zeros((len(values), len(numbers), count, count), values.dtype)
-    coupling = np.zeros((len(values), *shape), values.dtype)
-    for k, (first, middle, last, place) in enumerate(ends.tolist()):
-        own, other = middle - first, last - middle
-        pivots[k, :own], boundary[k, :other] = unknowns[first:middle], unknowns[middle:last]
-        square, rest = np.split(values[:, place : place + own * (own + other)], [own * own], axis=1)
-        inverse[:, k, :own, :own] = square.reshape(len(values), own, own)
-        coupling[:, k, :own, :other] = rest.reshape(len(values), own, other)
-    return Layer(*map(torch.from_numpy, (pivots, boundary, inverse, coupling)))

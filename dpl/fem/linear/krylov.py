@@ -51,22 +51,14 @@ def conjugate_gradients(
 ) -> Array:
     """Return x, (n,), with ||right - K x|| <= rtol ||right||.
 
-    The residual is that of the recurrence; rounding limits the true one.
+    M is symmetric positive definite and near K. The residual is that of the recurrence; rounding
+    limits the true one. `natural` takes the norm sqrt(r . M^-1 r) instead of the Euclidean norm.
+    With `abort_if_slow` the iteration stops after three or more steps if the residual, at its mean
+    rate of convergence, would not reach `rtol` within `max_iter`. A `SingularMatrix` is raised if K
+    is not positive definite or `max_iter` is not enough.
 
     Source: Hestenes, Stiefel (1952), J. Res. Natl. Bur. Stand. 49; Saad (2003), Iterative Methods
     for Sparse Linear Systems, algorithm 9.1.
-
-    Args:
-        product, precondition: Functions x -> K x and r -> M^-1 r. M is symmetric positive definite
-            and near K.
-        right, rtol, max_iter: Right-hand side (n,), relative residual and number of iterations at
-            which to stop.
-        abort_if_slow: Stop after three or more iterations if the residual, at its mean rate of
-            convergence, would not reach `rtol` within `max_iter`.
-        natural: Take the norm sqrt(r . M^-1 r) instead of the Euclidean norm.
-
-    Raises:
-        SingularMatrix: K is not positive definite, or `max_iter` is not enough.
     """
     if not right.any():
         return np.zeros_like(right)
@@ -137,20 +129,12 @@ def solve_unsymmetric(
     rtol: float,
     max_steps: int = MAX_STEPS,
 ) -> Array:
-    """Return x, (n,), with ||right - K x|| <= rtol ||right||, by GMRES.
+    """Return x, (n,), with ||right - K x|| <= rtol ||right||, by GMRES, or raise a SingularMatrix.
 
-    On bodies of 15,000 unknowns a symmetric factorisation with a few steps takes a tenth of the
-    time of an unsymmetric one by SuperLU.
-
-    Args:
-        pattern: Upper triangle of K.
-        symmetric, skew: Entries of (K + K^T) / 2 and of (K - K^T) / 2 on it, (nnz,); -skew solves
-            with K^T.
-        precondition, right, rtol: As of `conjugate_gradients`; M need not be symmetric.
-        max_steps: Largest number of steps in a cycle, and of stored vectors.
-
-    Raises:
-        SingularMatrix: The steps are not enough, or a number is not finite.
+    `symmetric` and `skew` are the entries of (K + K^T) / 2 and of (K - K^T) / 2 on the pattern,
+    (nnz,); -skew solves with K^T. M need not be symmetric. A cycle has, and stores, at most
+    `max_steps` vectors. On bodies of 15,000 unknowns a symmetric factorisation with a few steps
+    takes a tenth of the time of an unsymmetric one by SuperLU.
     """
     shape = pattern.size, pattern.size
     upper = csr_array((symmetric + skew, pattern.indices, pattern.indptr), shape=shape)

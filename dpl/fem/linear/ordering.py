@@ -39,7 +39,7 @@ class BandStorage(NamedTuple):
     Row j contains column j of the lower triangle from the diagonal down, as LAPACK expects it.
     """
 
-    order: NDArray[np.int32] | None  # old number of each new unknown, (n,); None: unchanged
+    order: NDArray[np.int32]  # old number of each new unknown, (n,)
     half: int  # half-bandwidth b, the largest distance of an entry from the diagonal
     place: NDArray[np.intp]  # flat index of each entry in the storage, (nnz,)
 
@@ -53,12 +53,12 @@ def band_storage(pattern: Pattern, sweeps: int = 50) -> BandStorage:
     """
     n = pattern.size
     rows, columns = row_numbers(pattern), pattern.indices
-    order, half = None, int((columns - rows).max(initial=0))
+    order, half = np.arange(n, dtype=np.int32), int((columns - rows).max(initial=0))
     ones = np.ones(len(rows), dtype=np.int8)
     upper = csr_matrix((ones, columns, pattern.indptr), shape=(n, n))
     graph = upper + upper.T
     trial, idle = reduce_bandwidth(graph), 0
-    for _ in range(sweeps):
+    for sweep in range(sweeps):
         rank = _inverse(trial)
         neighbours = rank[graph.indices]
         last = np.maximum.reduceat(neighbours, graph.indptr[:-1])
@@ -67,12 +67,11 @@ def band_storage(pattern: Pattern, sweeps: int = 50) -> BandStorage:
         idle += 1
         if width < half:
             order, half, idle = trial, width, 0
-        if order is None or idle > 10:
+        if idle > min(sweep, 10):  # none has brought a gain, or the last ten have not
             break
         trial = np.argsort(last + first, kind="stable").astype(np.int32)
-    if order is not None:
-        rank = _inverse(order)
-        rows, columns = rank[rows], rank[columns]
+    rank = _inverse(order)
+    rows, columns = rank[rows], rank[columns]
     column = np.minimum(rows, columns).astype(np.intp)
     return BandStorage(order, half, column * half + np.maximum(rows, columns))
 

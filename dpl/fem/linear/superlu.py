@@ -36,9 +36,7 @@ class SuperLUFactor(Factor):
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right."""
-        x = np.empty_like(right)
-        x[self.order] = self.lu.solve(right[self.order])
-        return x
+        return self.solve_many(right[None])[0]
 
     def solve_many(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return the solutions, (k, n), see `Factor.solve_many`."""

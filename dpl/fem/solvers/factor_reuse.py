@@ -52,19 +52,12 @@ class TangentSolver:
         definite: bool = False,
         skew: Array | None = None,
     ) -> Array:
-        """Return K(u)^-1 of a right-hand side (n,), to a relative residual `rtol`.
+        """Return K(u)^-1 of a right-hand side (n,), u (1, N, D), to a relative residual `rtol`.
 
-        Args:
-            tangent: Entries of K(u), (nnz,); None: K(0).
-            u: Displacement, (1, N, D) [-].
-            right, rtol: As of `conjugate_gradients`.
-            near: Whether u is near enough to the last iterate to reuse its factor.
-            definite: Refuse an indefinite tangent.
-            skew: Entries of (K - K^T) / 2, (nnz,); `tangent` is then the symmetric part. None: K is
-                symmetric.
-
-        Raises:
-            SingularMatrix: The tangent has no factor, or is indefinite and refused.
+        The tangent has the entries of K(u), (nnz,), or is None for K(0); with the entries `skew` of
+        (K - K^T) / 2 it is the symmetric part. `near` states that u is near enough to the last
+        iterate to reuse its factor. A tangent without a factor raises a `SingularMatrix`, and with
+        `definite` an indefinite one does too.
         """
         if tangent is None:
             self._rest = self._factor = self.linear_solver.factor

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import _lru_cache_wrapper, cached_property, lru_cache, partial
 from itertools import islice
 from typing import Any, Protocol, runtime_checkable
 
@@ -132,21 +132,11 @@ class LinearSolver:
     def with_parameters(self, parameters: Tensor) -> "LinearSolver":
         """Return the solver of `Problem.with_parameters`; the last `MAX_CLONES` are kept."""
         problem = self.problem.with_parameters(parameters)
-        if problem is self.problem:
-            return self
-        if problem not in self._clones:
-            if len(self._clones) >= MAX_CLONES:
-                self._clones.pop(next(iter(self._clones)))
-            self._clones[problem] = self._with_problem(problem)
-        return self._clones[problem]
+        return self if problem is self.problem else self._with_problem(problem)
 
     def forget_clones(self) -> None:
         """Drop the solvers of other parameters, so that their factors are computed again."""
-        self._clones.clear()
-
-    @cached_property
-    def _clones(self) -> "dict[Problem, LinearSolver]":
-        return {}
+        self._with_problem.cache_clear()
 
     @cached_property
     def reference(self) -> "LinearSolver":
@@ -154,8 +144,10 @@ class LinearSolver:
         problem = self.problem.reference
         return self if problem is self.problem else self._with_problem(problem)
 
-    def _with_problem(self, problem: Problem) -> "LinearSolver":
-        return replace(self, problem=problem, parent=self, approximate=None)
+    @cached_property
+    def _with_problem(self) -> "_lru_cache_wrapper[LinearSolver]":
+        change = partial(replace, self, parent=self, approximate=None)
+        return lru_cache(MAX_CLONES)(lambda problem: change(problem=problem))
 
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the linear solution; a force that does not fit the body is a ValueError."""

@@ -72,14 +72,10 @@ class ParityFactor(Factor):
 
     @classmethod
     def of(cls, problem: Problem, group: SymmetryGroup) -> Self:
-        """Factorise K(0) of a body.
-
-        Raises:
-            SingularMatrix: K(0) is not positive definite.
-        """
+        """Factorise K(0) of a body; raise a `SingularMatrix` if it is not positive definite."""
         form = OrbitForm.of(problem, group)
-        fronts, values = condense(form.matrices(problem), form.points)
-        blocks = Condensed(fronts, values.astype(np.float32))
+        exact = condense(form.matrices(problem), form.points)
+        blocks = exact._replace(values=exact.values.astype(np.float32))
         return cls(blocks, form.orbits, form.parities.characters)
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
@@ -87,8 +83,8 @@ class ParityFactor(Factor):
         images, signs, scales, characters = self._arrays
         parts = characters @ (scales * right[images])
         solved = np.empty_like(parts)
-        table, unknowns, _ = self.blocks.fronts
-        condensed_solves(table, unknowns, self.blocks.values, parts, solved)
+        table, unknowns, _, values = self.blocks
+        condensed_solves(table, unknowns, values, parts, solved)
         x = np.empty_like(right)
         x[images] = signs * (characters.T @ solved)
         return x

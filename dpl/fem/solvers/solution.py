@@ -169,11 +169,8 @@ def evaluate_solution(
 ) -> Solution:
     """Return a displacement (B, N, D) [-] as a solution, with its residual and min det F.
 
-    Args:
-        problem, displacement, load: The body, its displacement over L and the load on it.
-        tol: Relative residual below which it counts as converged [-], see `check_tol`.
-        iterations, seconds, from_guess: Values of the attributes of `Solution`.
-        evaluation: Internal force and min det F at the displacement, if known.
+    It counts as converged below the relative residual `tol` [-]. `evaluation` has the internal
+    force and min det F at the displacement, if known.
     """
     check_tol(tol)
     problem = problem.with_parameters(load.parameters)
