@@ -8,7 +8,7 @@ import skfem
 import torch
 
 from dpl.fem import LinearElastic, Material, NeoHookeanLn, Problem, box, rectangle
-from dpl.fem.assembly import basis_of
+from dpl.fem.assembly.elements import basis_of
 from dpl.fem.assembly.elements import CURVED
 from dpl.fem.mesh import check_mesh
 

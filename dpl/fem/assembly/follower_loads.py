@@ -39,11 +39,6 @@ class FollowerLoad:
     value: Stress
     name: str | None
 
-    @property
-    def parameter(self) -> str:
-        """Name of the parameter of a range."""
-        return self.name or self.default_name
-
     def stress(self, units: Units) -> tuple[float, ParameterRange | None]:
         """Return the stress over E [-], and None; NaN and its range [Pa] if loads decide it."""
         value, ends = self.value, None
@@ -167,7 +162,7 @@ class FollowerLoads:
         ranges: dict[str, ParameterRange] = {}
         values, parts = [], []
         for load in loads:
-            name = load.parameter
+            name = load.name or load.default_name
             try:
                 stress, ends = load.stress(units)
                 if ends and name in (*ranges, *material.parameter_ranges):

@@ -89,13 +89,10 @@ class Recovery:
     @cached_property
     def _tensor(self) -> Tensor:
         matrix = self.matrix
-        starts, columns = (
-            torch.from_numpy(part.astype(np.int64)) for part in (matrix.indptr, matrix.indices)
-        )
-        weights = torch.from_numpy(matrix.data)
+        parts = matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), matrix.data
         with warnings.catch_warnings(), torch.inference_mode(False):  # also for derivatives
             warnings.simplefilter("ignore")  # sparse matrices of torch are in beta state
-            return torch.sparse_csr_tensor(starts, columns, weights, matrix.shape)
+            return torch.sparse_csr_tensor(*map(torch.from_numpy, parts), matrix.shape)
 
 
 def _patches(adjacent: csr_array, boundary: NDArray[np.bool_]) -> csr_array:

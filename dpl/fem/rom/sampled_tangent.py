@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.assembly import reduced_loops
+from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.kernels import call_compiled, constants_of
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.linear.interface import full_matrix
@@ -86,8 +86,8 @@ class SampledTangent:
         out = np.empty_like(self._basis)
         u = displacement.contiguous().numpy()
         call_compiled(
-            reduced_loops.moduli_change_product,
-            *(Law.of(form, reduced_loops.SOURCES), constants_of(law)[0]),
+            element_loops.moduli_change_product,
+            *(Law.of(form, element_loops.SOURCES), constants_of(law)[0]),
             *(self._required_terms, float(law.finite)),
             *(u, self._nodes, self._dN, self._dV, self._basis, out),
         )
