@@ -2,9 +2,9 @@
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -482,26 +482,26 @@ class Problem:
             )
         if not self.parameter_ranges:
             return self
-        parameters = parameters.to(self.points.device, torch.float64)
-        is_new = len(parameters) > 1 or parameters.requires_grad
-        values = () if is_new else tuple(parameters[0].tolist())
-        if is_new or values not in self._bodies:
-            law, loads = self.material, self.follower_loads
-            if loads.ranges and self.young is not None:
-                stresses = parameters[:, len(law.parameter_ranges) :] / self.young
-                loads = loads.with_values(stresses)
-            law = law.with_parameters(self.law_parameters(parameters))
-            body = replace(self, material=law, follower_loads=loads)
-            if is_new:
-                return body
-            if len(self._bodies) >= MAX_BODIES:
-                self._bodies.pop(next(iter(self._bodies)))
-            self._bodies[values] = body
-        return self._bodies[values]
+        if len(parameters) > 1 or parameters.requires_grad:
+            return self._with_values(parameters)
+        return self._body_at(*parameters[0].tolist())
 
     @cached_property
-    def _bodies(self) -> dict[tuple[float, ...], Self]:
-        return {}
+    def _body_at(self) -> Callable[..., Self]:
+        """The problem with one value of each parameter, kept for the last `MAX_BODIES` ones."""
+
+        def body_at(*values: float) -> Self:
+            return self._with_values(torch.tensor([values], dtype=torch.float64))
+
+        return lru_cache(MAX_BODIES)(body_at)
+
+    def _with_values(self, parameters: Tensor) -> Self:
+        parameters = parameters.to(self.points.device, torch.float64)
+        law, loads = self.material, self.follower_loads
+        if loads.ranges and self.young is not None:
+            loads = loads.with_values(parameters[:, len(law.parameter_ranges) :] / self.young)
+        law = law.with_parameters(self.law_parameters(parameters))
+        return replace(self, material=law, follower_loads=loads)
 
     @cached_property
     def reference(self) -> Self:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dpl.fem.assembly import element_loops, lanes
 from dpl.fem.assembly.mean_dilatation import CellVolumes
-from dpl.fem.assembly.numba_laws import Law, required_terms
+from dpl.fem.assembly.numba_laws import Law
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.material import Material
 
@@ -34,7 +34,7 @@ class Kernels:
     """Compiled loops over cells of one law, see `dpl.fem.assembly.element_loops` and `with_law`."""
 
     constants: Array  # of the law
-    _law: tuple[Law, int, float]
+    _law: tuple[Law, float]  # and 1 for finite strains, else 0
     _frames: Array
     _bulk: Array | None = None
 
@@ -85,8 +85,7 @@ class Kernels:
         """Return the loops of a law that has a `compiled_form` over the same cells."""
         loops, form = copy.copy(self), material.compiled_form
         assert form is not None
-        needs = max(required_terms(form), int(self._volumes is not None and material.finite))
-        loops._law = Law.of(form, element_loops.SOURCES), needs, float(material.finite)
+        loops._law = Law.of(form, element_loops.SOURCES), float(material.finite)
         loops.constants, loops._frames = as_columns(material.constants), frames_of(material)
         if self._volumes is not None:
             loops._bulk = as_columns([self._volumes.point_bulk(material)])
@@ -100,12 +99,12 @@ class Kernels:
         Returns min det F, with a gap min det C of the mixed points. Members of a batch may have
         their own moduli.
         """
-        law, needs, finite = self._law
+        law, finite = self._law
         moduli, volumes = self.constants[member if len(self.constants) > 1 else 0], None
         if self._bulk is not None:
             volumes = self.functions, self._bulk[member if len(self._bulk) > 1 else 0]
         arguments = *self._body, volumes, self.places, force, values
-        kernel, given = element_loops.add_system, (law, moduli, self._frames, needs, finite)
+        kernel, given = element_loops.add_system, (law, moduli, self._frames, finite)
         return 1 + call_compiled(kernel, *given, u, gap, *arguments)
 
     @property

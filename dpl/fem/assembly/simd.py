@@ -194,19 +194,9 @@ def _overloaded_nonzero(x):
     return (lambda x: True) if isinstance(x, SIMDVector) else (lambda x: x != 0.0)
 
 
-@overload(arithmetic.exp)
-def _overloaded_exp(x):
-    return lambda x: _exp(x)
-
-
-@overload(arithmetic.positive_part)
-def _overloaded_positive_part(x):
-    return lambda x: choose(x, 0.0, 0.0, x)  # NaN stays
-
-
-@overload(arithmetic.step)
-def _overloaded_step(x):
-    return lambda x: choose(x, 0.0, 0.0, 1.0)
+overload(arithmetic.exp)(lambda x: lambda x: _exp(x))
+overload(arithmetic.positive_part)(lambda x: lambda x: choose(x, 0.0, 0.0, x))  # NaN stays
+overload(arithmetic.step)(lambda x: lambda x: choose(x, 0.0, 0.0, 1.0))
 
 
 def _vector(context: Any, builder: Any, value: Any, kind: Any) -> Any:
@@ -244,19 +234,12 @@ def _operator(function: Any, instruction: str) -> None:
     def of(x, y):
         kinds = (types.Float, types.Integer, SIMDVector)
         both = isinstance(x, kinds) and isinstance(y, kinds)
-        if both and (isinstance(x, SIMDVector) or isinstance(y, SIMDVector)):
-            return lambda x, y: apply(x, y)
-        return None
+        is_vector = isinstance(x, SIMDVector) or isinstance(y, SIMDVector)
+        return (lambda x, y: apply(x, y)) if both and is_vector else None
 
 
 _operator(operator.add, "fadd")
 _operator(operator.sub, "fsub")
 _operator(operator.mul, "fmul")
 _operator(operator.truediv, "fdiv")
-
-
-@overload(operator.neg)
-def _negative(x):
-    if isinstance(x, SIMDVector):
-        return lambda x: 0.0 - x
-    return None
+overload(operator.neg)(lambda x: (lambda x: 0.0 - x) if isinstance(x, SIMDVector) else None)
