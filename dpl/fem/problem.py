@@ -230,9 +230,7 @@ class Problem:
     def linearise(self, displacement: Tensor, gap: Any = None) -> System:
         """Return the linearised equilibrium at (1, N, D), without derivatives.
 
-        Args:
-            displacement: u.
-            gap: What `update_strain_gap` returned; None for plain Newton.
+        The gap is that of `update_strain_gap`; None for plain Newton.
         """
         force, tangent, lowest = self._loops(displacement).linearise(displacement, gap)
         with torch.no_grad():
@@ -247,22 +245,16 @@ class Problem:
 
         The strain at a mixed point advances linearly with length * update, and by the same part of
         the gap before the step. The gap is the difference to the strain of u. With mean dilatation
-        the same holds for the volume changes of the cells.
-
-        Args:
-            gap: Before the step; None: none.
-            length: Part of the step that is taken.
-            update: The full step, (1, N, D) [-].
-            displacement: u after the step, (1, N, D) [-]; needed with mean dilatation only.
+        the same holds for the volume changes of the cells. The gap before the step may be None.
+        `update` is the full step and `displacement`, needed with mean dilatation only, u after the
+        step, (1, N, D) [-].
         """
         return self._loops(update).update_strain_gap(gap, length, update, displacement)
 
     def _loops(self, displacement: Tensor) -> CompiledLoops | TensorAssembly:
         """Return the compiled loops, or the tensor operations where there are none.
 
-        Raises:
-            ValueError: The displacement is that of another body: the loops would run past its end.
-                Or not in float64.
+        The loops would run past the end of a displacement of another body.
         """
         if tuple(displacement.shape[1:]) != tuple(self.shape):
             found, wanted = tuple(displacement.shape), ("B", *self.shape)
@@ -484,10 +476,11 @@ class Problem:
             return self
         if len(parameters) > 1 or parameters.requires_grad:
             return self._with_values(parameters)
-        return self._body_at(*parameters[0].tolist())
+        body: Self = self._body_at(*parameters[0].tolist())
+        return body
 
     @cached_property
-    def _body_at(self) -> Callable[..., Self]:
+    def _body_at(self) -> Callable[..., Any]:
         """The problem with one value of each parameter, kept for the last `MAX_BODIES` ones."""
 
         def body_at(*values: float) -> Self:

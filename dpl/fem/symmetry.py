@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -49,6 +49,13 @@ class SymmetryGroup(tuple[Symmetry, ...]):
     """The symmetries of a body, the identity first."""
 
     __slots__ = ()
+
+    @classmethod
+    def identity(cls, problem: Problem) -> Self:
+        """Return the group of the identity alone."""
+        (nodes, dim), device = problem.shape, problem.points.device
+        rotation = torch.eye(dim, dtype=torch.float64, device=device)
+        return cls([Symmetry(rotation, torch.arange(nodes, device=device))])
 
     @property
     def rotations(self) -> Tensor:
@@ -121,10 +128,8 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> SymmetryGrou
         )
 
     motions = _motions(points, np.count_nonzero(problem.free.cpu().numpy(), axis=1))
-    nodes, dim = problem.shape
-    identity = torch.eye(dim, dtype=torch.float64), torch.arange(nodes)
-    moved = [Symmetry(*(part.to(fields.device) for part in pair)) for pair in [*motions, identity]]
-    found = list(filter(holds, moved[:-1])) or moved[-1:]
+    moved = [Symmetry(*(part.to(fields.device) for part in pair)) for pair in motions]
+    found = list(filter(holds, moved)) or SymmetryGroup.identity(problem)
     return SymmetryGroup(sorted(_closed(found), key=lambda symmetry: symmetry.source.tolist()))
 
 

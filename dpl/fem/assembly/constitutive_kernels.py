@@ -370,16 +370,14 @@ def nominal_moduli(F, directions, first, D, S, weight, finite, A, q, Q):
     """
     B, T = registers(54), registers(6)  # B: the changes of E, shear doubled, rows 6 (3 i + d) + v
     for i in range(3):
-        f0, f1, f2 = load(F, 3 * i), load(F, 3 * i + 1), load(F, 3 * i + 2)
         for d in range(3):
-            r, n = 6 * (3 * i + d), first + 3 * d
-            n0, n1, n2 = load(directions, n), load(directions, n + 1), load(directions, n + 2)
-            store(B, r, f0 * n0)
-            store(B, r + 1, f1 * n1)
-            store(B, r + 2, f2 * n2)
-            store(B, r + 3, f0 * n1 + f1 * n0)
-            store(B, r + 4, f1 * n2 + f2 * n1)
-            store(B, r + 5, f0 * n2 + f2 * n0)
+            n = first + 3 * d
+            for v in range(6):
+                a, b = FIRST[v], SECOND[v]
+                change = load(F, 3 * i + a) * load(directions, n + b)
+                if v > 2:
+                    change = change + load(F, 3 * i + b) * load(directions, n + a)
+                store(B, 6 * (3 * i + d) + v, change)
     row = q
     for r in range(9):
         for v in range(6):

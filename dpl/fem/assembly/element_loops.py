@@ -246,6 +246,10 @@ def update_gap(law, gap, length, update, u, cells, reference, inverse, dV, psi):
     M = 0 if psi is None else psi.shape[2]
     strains = np.zeros((blocks, Q, 6, SIMD_WIDTH))
     volumes = np.zeros((blocks, M, SIMD_WIDTH))
+    if len(strain_gap) > 0:
+        strains += (1.0 - length) * strain_gap
+    if len(volume_gap) > 0:
+        volumes += (1.0 - length) * volume_gap
     ue, G, H, F = rows(3 * n), rows(9 * Q), registers(9), registers(9)
     at, deformed = rows(3 * n), rows(9 * Q)
     for block in range(blocks):
@@ -254,14 +258,8 @@ def update_gap(law, gap, length, update, u, cells, reference, inverse, dV, psi):
         if psi is not None:
             gather(u, numbers[block], dim, at)
             slopes_of_cell(reference, at, deformed)
-            if len(volume_gap) > 0:
-                for m in range(M):
-                    store(volumes[block], m, (1.0 - length) * load(volume_gap[block], m))
         for q in range(Q):
             own, first = strains[block, q], first_row(inverse, block, q)
-            if len(strain_gap) > 0:
-                for v in range(6):
-                    store(own, v, (1.0 - length) * load(strain_gap[block, q], v))
             gradient(G, q, inverse, first, H)
             for r in range(9):
                 store(H, r, length * load(H, r))
