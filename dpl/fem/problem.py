@@ -483,7 +483,7 @@ class Problem:
     def _body_at(self) -> Callable[..., Any]:
         """The problem with one value of each parameter, kept for the last `MAX_BODIES` ones."""
 
-        def body_at(*values: float) -> Self:
+        def body_at(*values: float) -> Any:
             return self._with_values(torch.tensor([values], dtype=torch.float64))
 
         return lru_cache(MAX_BODIES)(body_at)
