@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem import Load, Problem, SingularMatrix, Solution, Solver, Status, installed_backends
-from dpl.fem.assembly import Pattern
+from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.linear import Backend, make_backend
 
 COUNTING_BACKEND = (

@@ -131,7 +131,7 @@ def law_and_moduli(cfg: DictConfig) -> tuple[Material, ParameterRange]:
             return law.over(young), ParameterRange(young, young)
     given = OmegaConf.to_container(cfg.young) if OmegaConf.is_config(cfg.young) else cfg.young
     with error_in(""):
-        moduli = ParameterRange.of_young(typing.cast("Any", given))
+        moduli = ParameterRange.of("young", given, is_modulus=True)
     with error_in("material"):
         return law.normalised(), moduli
 

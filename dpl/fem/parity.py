@@ -99,17 +99,13 @@ class SignedOrbits(NamedTuple):
             in_blocks(weight[:, None, None, None].expand(-1, count, dim, dim)),
         )
 
-    def by_parity(self, force: Tensor, parities: Parities) -> Tensor:
-        """Return the products (M, m) of a force (n,) with the field of each orbit and parity."""
-        return torch.stack([self._products(force, one) for one in parities.characters])
-
     def coordinates(self, values: Tensor, characters: Tensor) -> Tensor:
         """Return coordinates (..., m) of the parts of fields (..., n) of one parity.
 
         The parity has the factors `characters` (M,). The basis is orthonormal. It has one field for
         each orbit, which is zero, as is its coordinate, where the parity allows no other value.
         """
-        return self._products(values, characters) * self._scale(characters).to(values)
+        return self.products(values, characters) * self._scale(characters).to(values)
 
     def fields(self, coordinates: Tensor, characters: Tensor, count: int) -> Tensor:
         """Return fields (..., n) that have exactly one parity, n = `count`, see `coordinates`."""
@@ -130,7 +126,7 @@ class SignedOrbits(NamedTuple):
             result[:, parity == p] = self.fields(coordinates, characters, len(matrix)).T
         return result
 
-    def _products(self, values: Tensor, characters: Tensor) -> Tensor:
+    def products(self, values: Tensor, characters: Tensor) -> Tensor:
         """Return products (..., m) of values (..., n) with the field of a parity of each orbit."""
         rows = zip(characters, self.sign, self.images, strict=True)
         products = sum(
@@ -148,8 +144,3 @@ class SignedOrbits(NamedTuple):
         """Return one over the norm of the field of a parity of each orbit, or 0, (m,)."""
         squares = len(characters) * self.weight
         return torch.where(self._allowed(characters), squares.rsqrt(), 0.0)
-
-    def of_parity(self, matrix: Tensor, columns: Tensor) -> Tensor:
-        """Return the rows of one value of each orbit in some columns, (m, r), of (n, R)."""
-        rows = matrix[self.images[0]][:, columns]
-        return torch.where(self.weight[:, None] > 0, rows, 0.0)

@@ -2,9 +2,9 @@
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -230,9 +230,7 @@ class Problem:
     def linearise(self, displacement: Tensor, gap: Any = None) -> System:
         """Return the linearised equilibrium at (1, N, D), without derivatives.
 
-        Args:
-            displacement: u.
-            gap: What `update_strain_gap` returned; None for plain Newton.
+        The gap is that of `update_strain_gap`; None for plain Newton.
         """
         force, tangent, lowest = self._loops(displacement).linearise(displacement, gap)
         with torch.no_grad():
@@ -247,22 +245,16 @@ class Problem:
 
         The strain at a mixed point advances linearly with length * update, and by the same part of
         the gap before the step. The gap is the difference to the strain of u. With mean dilatation
-        the same holds for the volume changes of the cells.
-
-        Args:
-            gap: Before the step; None: none.
-            length: Part of the step that is taken.
-            update: The full step, (1, N, D) [-].
-            displacement: u after the step, (1, N, D) [-]; needed with mean dilatation only.
+        the same holds for the volume changes of the cells. The gap before the step may be None.
+        `update` is the full step and `displacement`, needed with mean dilatation only, u after the
+        step, (1, N, D) [-].
         """
         return self._loops(update).update_strain_gap(gap, length, update, displacement)
 
     def _loops(self, displacement: Tensor) -> CompiledLoops | TensorAssembly:
         """Return the compiled loops, or the tensor operations where there are none.
 
-        Raises:
-            ValueError: The displacement is that of another body: the loops would run past its end.
-                Or not in float64.
+        The loops would run past the end of a displacement of another body.
         """
         if tuple(displacement.shape[1:]) != tuple(self.shape):
             found, wanted = tuple(displacement.shape), ("B", *self.shape)
@@ -482,26 +474,27 @@ class Problem:
             )
         if not self.parameter_ranges:
             return self
-        parameters = parameters.to(self.points.device, torch.float64)
-        is_new = len(parameters) > 1 or parameters.requires_grad
-        values = () if is_new else tuple(parameters[0].tolist())
-        if is_new or values not in self._bodies:
-            law, loads = self.material, self.follower_loads
-            if loads.ranges and self.young is not None:
-                stresses = parameters[:, len(law.parameter_ranges) :] / self.young
-                loads = loads.with_values(stresses)
-            law = law.with_parameters(self.law_parameters(parameters))
-            body = replace(self, material=law, follower_loads=loads)
-            if is_new:
-                return body
-            if len(self._bodies) >= MAX_BODIES:
-                self._bodies.pop(next(iter(self._bodies)))
-            self._bodies[values] = body
-        return self._bodies[values]
+        if len(parameters) > 1 or parameters.requires_grad:
+            return self._with_values(parameters)
+        body: Self = self._body_at(*parameters[0].tolist())
+        return body
 
     @cached_property
-    def _bodies(self) -> dict[tuple[float, ...], Self]:
-        return {}
+    def _body_at(self) -> Callable[..., Any]:
+        """The problem with one value of each parameter, kept for the last `MAX_BODIES` ones."""
+
+        def body_at(*values: float) -> Any:
+            return self._with_values(torch.tensor([values], dtype=torch.float64))
+
+        return lru_cache(MAX_BODIES)(body_at)
+
+    def _with_values(self, parameters: Tensor) -> Self:
+        parameters = parameters.to(self.points.device, torch.float64)
+        law, loads = self.material, self.follower_loads
+        if loads.ranges and self.young is not None:
+            loads = loads.with_values(parameters[:, len(law.parameter_ranges) :] / self.young)
+        law = law.with_parameters(self.law_parameters(parameters))
+        return replace(self, material=law, follower_loads=loads)
 
     @cached_property
     def reference(self) -> Self:

@@ -20,7 +20,6 @@ class ParameterRange(tuple[float, float]):
     is_log: bool
 
     def __new__(cls, low: float, high: float, *, is_log: bool = False) -> Self:
-        """Return the range."""
         made = super().__new__(cls, (float(low), float(high)))
         made.is_log = is_log
         return made
@@ -29,41 +28,43 @@ class ParameterRange(tuple[float, float]):
         """Return True for a range, or a pair of numbers, with these ends and distribution."""
         return tuple.__eq__(self, other) is True and self.is_log == getattr(other, "is_log", False)
 
-    def __ne__(self, other: object) -> bool:
-        """Return the opposite of ==, which a tuple defines by itself."""
+    def __ne__(self, other: object) -> bool:  # a tuple defines it by itself
         return not self == other
 
     __hash__ = tuple.__hash__
 
     def __getnewargs_ex__(self) -> tuple[tuple[float, ...], dict[str, bool]]:
-        """Return the arguments with which a copy is made."""
         return tuple(self), {"is_log": self.is_log}
 
     @classmethod
-    def of(cls, name: str, value: Any) -> "ParameterRange":
-        """Return the range of [low, high] or of {low, high, distribution}."""
-        ends, distribution = _parts(name, value)
-        if len(ends) != 2 or not ends[0] < ends[1]:
+    def of(cls, name: str, value: Any, *, is_modulus: bool = False) -> "ParameterRange":
+        """Return the range of [low, high] or of {low, high, distribution}.
+
+        The range of Young's moduli [Pa], `is_modulus`, may also be a number, or have low = high.
+        """
+        options = dict(value) if isinstance(value, Mapping) else {}
+        ends = [options.pop("low", None), options.pop("high", None)] if options else value
+        ends = list(ends) if isinstance(ends, Sequence) else [ends, ends]
+        usual = "log" if getattr(value, "is_log", False) else "uniform"
+        distribution = options.pop("distribution", usual)
+        if distribution not in DISTRIBUTIONS:
+            raise ValueError(f"{name}.distribution = {distribution!r} must be uniform or log")
+        finite = [float(x) for x in ends if isinstance(x, int | float) and math.isfinite(x)]
+        is_pair = len(finite) == len(ends) == 2 and not options
+        low, high = finite if is_pair else (math.nan, math.nan)
+        if is_modulus and not 0 < low <= high:
+            raise ValueError(
+                f"{name} = {value} must be a number, an ascending range [low, high] or "
+                "{low, high, distribution}, above 0 [Pa]"
+            )
+        if not (low < high or is_modulus):
             raise ValueError(
                 f"{name} = {value} must be a range [low, high], low below high, or "
                 "{low, high, distribution}"
             )
-        if distribution == "log" and not ends[0] > 0:
+        if distribution == "log" and not low > 0:
             raise ValueError(f"{name} = {value} must be above 0 for a logarithmic distribution")
-        return cls(*ends, is_log=distribution == "log")
-
-    @classmethod
-    def of_young(cls, young: Young) -> "ParameterRange":
-        """Return the range of Young's moduli [Pa]: a number, [low, high], low = high allowed, or
-        {low, high, distribution}.
-        """
-        ends, distribution = _parts("young", young)
-        if len(ends) != 2 or not 0 < ends[0] <= ends[1]:
-            raise ValueError(
-                f"young = {young} must be a number, an ascending range [low, high] or "
-                "{low, high, distribution}, above 0 [Pa]"
-            )
-        return cls(*ends, is_log=distribution == "log")
+        return cls(low, high, is_log=distribution == "log")
 
     @property
     def middle(self) -> float:
@@ -85,22 +86,6 @@ class ParameterRange(tuple[float, float]):
         if self.is_log:
             low, high, values, half = math.log(low), math.log(high), values.log(), 1.0
         return (2 * values - (low + high)) / ((high - low) or 2 * half)
-
-
-def _parts(name: str, value: Any) -> tuple[list[float], str]:
-    """Return the ends of a number, [low, high] or {low, high, distribution}, and the distribution.
-
-    There are no ends if the value is none of these, or has an end that is not finite.
-    """
-    options = dict(value) if isinstance(value, Mapping) else {}
-    ends = [options.pop("low", None), options.pop("high", None)] if options else value
-    ends = list(ends) if isinstance(ends, Sequence) else [ends, ends]
-    usual = "log" if getattr(value, "is_log", False) else "uniform"
-    distribution = options.pop("distribution", usual)
-    if distribution not in DISTRIBUTIONS:
-        raise ValueError(f"{name}.distribution = {distribution!r} must be uniform or log")
-    numbers = [float(x) for x in ends if isinstance(x, int | float) and math.isfinite(x)]
-    return [] if options or len(numbers) != len(ends) else numbers, distribution
 
 
 def is_range(value: object) -> bool:

@@ -71,7 +71,7 @@ def test_one_law_without_fibres_has_nothing_of_its_cells(make_scene, monkeypatch
     passes, original = [], element_loops.add_system
 
     def counted(law, constants, frames, *rest):
-        passes.append((constants.shape[0], frames.size, rest[8]))
+        passes.append((constants.shape[0], frames.size, rest[7]))
         return original(law, constants, frames, *rest)
 
     counted.stats = original.stats

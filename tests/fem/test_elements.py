@@ -8,8 +8,7 @@ import skfem
 import torch
 
 from dpl.fem import LinearElastic, Material, NeoHookeanLn, Problem, box, rectangle
-from dpl.fem.assembly import basis_of
-from dpl.fem.assembly.elements import CURVED
+from dpl.fem.assembly.elements import CURVED, basis_of
 from dpl.fem.mesh import check_mesh
 
 H = np.array([[0.02, 0.05, -0.01], [0.03, -0.04, 0.02], [-0.02, 0.01, 0.03]])

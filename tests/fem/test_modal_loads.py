@@ -288,13 +288,14 @@ def test_moduli_fill_their_range_by_their_distribution(linear, low, distribution
 @pytest.mark.parametrize("distribution", ["uniform", "log"])
 def test_one_modulus_is_a_range_without_width(distribution):
     ends = {"low": 4500.0, "high": 4500.0}
-    moduli = fem.ParameterRange.of_young({**ends, "distribution": distribution})
+    of_young = partial(fem.ParameterRange.of, "young", is_modulus=True)
+    moduli = of_young({**ends, "distribution": distribution})
     t = torch.linspace(0, 1, 7).double()
     assert_close(moduli.at(t), torch.full_like(t, 4500.0), rtol=1e-15, atol=0)
     assert float(moduli.normalise(torch.tensor(4500.0).double())) == 0
     assert moduli.middle == pytest.approx(4500.0)
-    same = fem.ParameterRange.of_young([4500.0, 4500.0])
+    same = of_young([4500.0, 4500.0])
     assert (moduli == same) == (distribution == "uniform")
     assert (moduli != same) == (distribution == "log")
-    assert same == fem.ParameterRange.of_young(4500.0)
-    assert fem.ParameterRange.of_young(moduli) == moduli
+    assert same == of_young(4500.0)
+    assert of_young(moduli) == moduli

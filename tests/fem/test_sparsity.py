@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dpl.fem import NeoHookeanLn, Problem
-from dpl.fem.assembly import Pattern
+from dpl.fem.assembly.sparsity import Pattern
 
 
 @pytest.fixture

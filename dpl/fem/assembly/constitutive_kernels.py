@@ -117,38 +117,37 @@ def invert(e, X, Y):
 
 
 @inlined
-def derivatives_at(law, c, needs, i1, e, j):
+def derivatives_at(law, c, i1, e, j):
     """Return the invariant derivatives of a law at e with I1 - 3 = i1 and det F = 1 + j."""
     e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
     e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
     i2 = 2.0 * i1 + (e1 * e2 - e4 * e4 + (e0 * e2 - e5 * e5) + (e0 * e1 - e3 * e3))
-    log_j, m1 = j, j
-    if needs > 1:
-        log_j = log1p(j)
-        if needs > 2:
-            m1 = expm1(-2 / 3 * log_j)
-    return derivatives_of(law, c, i1, i2, j, log_j, m1)
+    log_j = log1p(j)  # LLVM removes what the law does not use
+    return derivatives_of(law, c, i1, i2, j, log_j, expm1(-2 / 3 * log_j))
 
 
 @inlined
-def stress(law, c, needs, e, j, X, S, D, moduli):
-    """Set S and X = C^-1, and with `moduli` D = dS/dE (rows 6 I + J), at e with det F = 1 + j.
+def stress(law, c, e, j, X, S, D, moduli):
+    """Set S, with `moduli` also D = dS/dE (rows 6 I + J), at e with det F = 1 + j.
 
-    The constants c are rows of vectors. The stress of laws with ln J is NaN where det F is
-    negative.
+    The constants c are rows of vectors. X becomes C^-1, or 0 for a law without it. The stress of
+    laws with ln J is NaN where det F is negative.
     """
     Y = registers(6)
-    if needs > 0:
-        invert(e, X, Y)
     i1 = load(e, 0) + load(e, 1) + load(e, 2)
-    derivatives = derivatives_at(law, c, needs, i1, e, j)
-    rest, W2, p = derivatives[:3]
+    derivatives = derivatives_at(law, c, i1, e, j)
+    rest, W2, p, _, _, _, W1J, W2J, pJ = derivatives
+    if nonzero(p) or nonzero(W1J) or nonzero(W2J) or nonzero(pJ):
+        invert(e, X, Y)
+    else:
+        for v in range(6):
+            store(X, v, 0.0)
     pressure = rest + 2.0 * W2 * i1
     for v in range(6):
         stress = pressure if v < 3 else 0.0 * pressure
         if nonzero(W2):
             stress = stress - 2.0 * W2 * load(e, v)
-        if needs > 0:
+        if nonzero(p):
             stress = stress - p * load(Y, v)
         store(S, v, stress)
     if moduli:
@@ -158,7 +157,7 @@ def stress(law, c, needs, e, j, X, S, D, moduli):
 
 
 @inlined
-def dilatation(law, c, needs, finite, bulk, j):
+def dilatation(law, c, finite, bulk, j):
     """Return dU/dJ and d2U/dJ2 at J = 1 + j of the energy U that mean dilatation projects.
 
     `bulk` is the bulk modulus that stays at the points. See `dpl.fem.assembly.mean_dilatation`.
@@ -316,7 +315,7 @@ def cofactor(H, i, j):
 
 
 @inlined
-def isotropic_stress(law, c, needs, finite, H, j, weight, P):
+def isotropic_stress(law, c, finite, H, j, weight, P):
     """Set P to what `stress` and `nominal_stress` give for a law without fibres, with fewer terms.
 
     F C^-1 is the transposed inverse of F, and F minus it is made of H without rounding 1 + H.
@@ -327,7 +326,7 @@ def isotropic_stress(law, c, needs, finite, H, j, weight, P):
     for r in range(1, 9):
         square = square + load(H, r) * load(H, r)
     i1 = 2.0 * trace + finite * square
-    rest, W2, p = derivatives_at(law, c, needs, i1, e, j)[:3]
+    rest, W2, p = derivatives_at(law, c, i1, e, j)[:3]
     pressure = weight * (rest + 2.0 * W2 * i1)
     for r in range(9):
         store(P, r, finite * pressure * load(H, r) + (1.0 if r % 4 == 0 else 0.0) * pressure)
@@ -341,7 +340,7 @@ def isotropic_stress(law, c, needs, finite, H, j, weight, P):
                 product = h0 * load(e, v0) + h1 * load(e, v1) + h2 * load(e, v2)
                 product = product + load(e, VOIGT[i, k])
                 store(P, 3 * i + k, load(P, 3 * i + k) - factor * product)
-    if needs > 0:
+    if nonzero(p):
         factor = weight * p / (1.0 + j)
         for i in range(3):
             for k in range(3):
@@ -371,16 +370,14 @@ def nominal_moduli(F, directions, first, D, S, weight, finite, A, q, Q):
     """
     B, T = registers(54), registers(6)  # B: the changes of E, shear doubled, rows 6 (3 i + d) + v
     for i in range(3):
-        f0, f1, f2 = load(F, 3 * i), load(F, 3 * i + 1), load(F, 3 * i + 2)
         for d in range(3):
-            r, n = 6 * (3 * i + d), first + 3 * d
-            n0, n1, n2 = load(directions, n), load(directions, n + 1), load(directions, n + 2)
-            store(B, r, f0 * n0)
-            store(B, r + 1, f1 * n1)
-            store(B, r + 2, f2 * n2)
-            store(B, r + 3, f0 * n1 + f1 * n0)
-            store(B, r + 4, f1 * n2 + f2 * n1)
-            store(B, r + 5, f0 * n2 + f2 * n0)
+            n = first + 3 * d
+            for v in range(6):
+                a, b = FIRST[v], SECOND[v]
+                change = load(F, 3 * i + a) * load(directions, n + b)
+                if v > 2:
+                    change = change + load(F, 3 * i + b) * load(directions, n + a)
+                store(B, 6 * (3 * i + d) + v, change)
     row = q
     for r in range(9):
         for v in range(6):

@@ -18,7 +18,7 @@ from dpl.fem.assembly.elements import (
     reference_gradients,
 )
 from dpl.fem.assembly.kernels import CompiledLoops, Kernels
-from dpl.fem.assembly.mean_dilatation import POINT_SHEAR, CellVolumes
+from dpl.fem.assembly.mean_dilatation import POINT_SHEAR, CellVolumes, polynomials
 from dpl.fem.assembly.recovery import Recovery
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
@@ -37,7 +37,7 @@ def geometry(basis: skfem.Basis, degree: int, *, mean_dilatation: bool) -> dict[
         at = np.asarray(basis.global_coordinates())[:, : len(dV)].transpose(1, 2, 0)
         points = torch.from_numpy(np.ascontiguousarray(at))
         linear = degree == 2 and not is_simplex(basis.mesh)
-        functions = CellVolumes.of(points, torch.from_numpy(dV.copy()), linear=linear).functions
+        functions = polynomials(points, torch.from_numpy(dV.copy()), linear=linear)
     boundary = np.zeros(basis.N, dtype=bool)
     boundary[basis.get_dofs(basis.mesh.boundary_facets()).all()] = True
     arrays = {
@@ -121,19 +121,17 @@ class Discretisation:
         groups = material.groups(len(self.cells))
         if any(law.compiled_form is None for law, _ in groups):
             return None
-        loops = [self._loop(cells, law) for law, cells in groups]
+        loops = [self._loops_over(cells.numpy()).with_law(law) for law, cells in groups]
         return CompiledLoops(loops, len(self.pattern.indices))
 
-    def _loop(self, chosen: Tensor, law: Material) -> Kernels:
-        """Return the loops over some cells, which share the arrays of their first law."""
-        numbers = chosen.numpy()
+    def _loops_over(self, numbers: NDArray[np.int64]) -> Kernels:
+        """Return the loops over some cells, whose arrays all laws share."""
         key = numbers.tobytes()
         if key not in self._kernels:
             own, volumes = [0] if self.equal_cells else numbers, self.volumes
             if volumes is not None:
                 volumes = volumes._replace(functions=volumes.functions[own])
             self._kernels[key] = Kernels(
-                law,
                 cells=self.cells.numpy()[numbers],
                 reference=reference_gradients(self.mesh, self.degree),
                 dN=self.dN.numpy()[own],
@@ -141,7 +139,7 @@ class Discretisation:
                 places=self.pattern.places.reshape(len(self.cells), -1)[numbers],
                 volumes=volumes,
             )
-        return self._kernels[key].with_law(law)
+        return self._kernels[key]
 
     @cached_property
     def _kernels(self) -> dict[bytes, Kernels]:

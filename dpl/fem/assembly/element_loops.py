@@ -1,4 +1,4 @@
-"""Compiled loops over the cells of a body: internal force, tangent and det F.
+"""Compiled loops over cells: internal force, tangent, det F, and moduli times a basis.
 
 `SIMD_WIDTH` cells are processed at once, one per SIMD lane. The operations at a quadrature point
 are in `dpl.fem.assembly.constitutive_kernels`. With mean dilatation the polynomials of the volume
@@ -52,7 +52,7 @@ def add_projected(value, functions, out):
 
 @inlined
 def pressures_of_cells(
-    law, c, needs, finite, G, inverse, block, weights, functions, bulk, gap, j, out, low
+    law, c, finite, G, inverse, block, weights, functions, bulk, gap, j, out, low
 ):  # fmt: skip
     """Set the coefficients of the pressures of a block of cells and their derivatives.
 
@@ -77,7 +77,7 @@ def pressures_of_cells(
         change, psi, weight = value_of(j, functions[q]), functions[q], load(weights, q)
         if mixed:
             keep_minimum(change, low)
-        pressure, modulus = point.dilatation(law, c, needs, finite, load(bulk, 0), change)
+        pressure, modulus = point.dilatation(law, c, finite, load(bulk, 0), change)
         add_projected(weight * pressure, psi, p)
         if mixed:
             pressure = pressure + modulus * value_of(gap, psi)
@@ -109,7 +109,7 @@ def add_volumetric_stiffness(slopes, D, dim, C, K):
 
 @njit(error_model="numpy", cache=True)
 def add_system(
-    law, c, frames, needs, finite, u, gap, cells, reference, inverse, dV, volumes, places, force,
+    law, c, frames, finite, u, gap, cells, reference, inverse, dV, volumes, places, force,
     values,
 ):  # fmt: skip
     """Add force to (N, D) and, unless empty, tangent to (nnz + SPARE,) at displacements u (N, D).
@@ -161,7 +161,7 @@ def add_system(
             weights = dV[block if len(dV) > 1 else 0]
             own = volume_gap[block] if mixed else no_gap
             pressures_of_cells(
-                *(law, constants, needs, finite, G, inverse, block, weights, functions, bulk),
+                *(law, constants, finite, G, inverse, block, weights, functions, bulk),
                 *(own, work, pressures, low),
             )
         for q in range(Q):
@@ -172,7 +172,7 @@ def add_system(
             change = point.volume_change(H)
             if plain:
                 keep_minimum(change, low)
-                point.isotropic_stress(law, constants, needs, finite, H, change, weight, T)
+                point.isotropic_stress(law, constants, finite, H, change, weight, T)
                 point.along(T, inverse, first, P, 9 * q)
                 continue
             for r in range(9):
@@ -183,15 +183,14 @@ def add_system(
                 change = point.reduce_strain(strain_gap[block, q], e)
             keep_minimum(change, low)
             j = change / (1.0 + sqrt(1.0 + change)) if mixed else change
-            point.stress(law, constants, needs, e, j, X, S, D, moduli)
+            point.stress(law, constants, e, j, X, S, D, moduli)
             if volumes is not None:
                 own_j = j if finite > 0.0 else point.change_of_volume(H, finite)
+                point.invert(e, X, Y)  # also for laws without C^-1
                 if finite == 0.0:
                     for v in range(6):
                         store(X, v, 1.0 if v < 3 else 0.0)
-                pressure, modulus = point.dilatation(
-                    law, constants, needs, finite, load(bulk, 0), own_j
-                )
+                pressure, modulus = point.dilatation(law, constants, finite, load(bulk, 0), own_j)
                 own_J = 1.0 + finite * j
                 point.add_pressure(-pressure, -modulus, own_J, X, finite, S, D, moduli)
             for v in range(6):
@@ -247,6 +246,10 @@ def update_gap(law, gap, length, update, u, cells, reference, inverse, dV, psi):
     M = 0 if psi is None else psi.shape[2]
     strains = np.zeros((blocks, Q, 6, SIMD_WIDTH))
     volumes = np.zeros((blocks, M, SIMD_WIDTH))
+    if len(strain_gap) > 0:
+        strains += (1.0 - length) * strain_gap
+    if len(volume_gap) > 0:
+        volumes += (1.0 - length) * volume_gap
     ue, G, H, F = rows(3 * n), rows(9 * Q), registers(9), registers(9)
     at, deformed = rows(3 * n), rows(9 * Q)
     for block in range(blocks):
@@ -255,14 +258,8 @@ def update_gap(law, gap, length, update, u, cells, reference, inverse, dV, psi):
         if psi is not None:
             gather(u, numbers[block], dim, at)
             slopes_of_cell(reference, at, deformed)
-            if len(volume_gap) > 0:
-                for m in range(M):
-                    store(volumes[block], m, (1.0 - length) * load(volume_gap[block], m))
         for q in range(Q):
             own, first = strains[block, q], first_row(inverse, block, q)
-            if len(strain_gap) > 0:
-                for v in range(6):
-                    store(own, v, (1.0 - length) * load(strain_gap[block, q], v))
             gradient(G, q, inverse, first, H)
             for r in range(9):
                 store(H, r, length * load(H, r))
@@ -274,3 +271,53 @@ def update_gap(law, gap, length, update, u, cells, reference, inverse, dV, psi):
                 functions = psi[block if len(psi) > 1 else 0]
                 add_projected(weight * change, functions[q], volumes[block])
     return strains, volumes
+
+
+@inlined
+def set_moduli(law, c, finite, H, A):
+    """Set A (rows of `PAIR`) to dP/dF at H."""
+    e, X, S, F = registers(6), registers(6), registers(6), registers(9)
+    D, unit = registers(36), registers(9)
+    point.strain(H, finite, e)
+    point.stress(law, c, e, point.volume_change(H), X, S, D, True)
+    for r in range(9):
+        store(unit, r, 1.0 if r % 4 == 0 else 0.0)
+        store(F, r, finite * load(H, r) + load(unit, r))
+    point.nominal_moduli(F, unit, 0, D, S, 1.0, finite, A, 0, 1)
+
+
+@njit(error_model="numpy", cache=True)
+def moduli_change_product(law, c, finite, u, cells, dN, dV, basis, out):
+    """Set out to dV (A(H) - A(0)) G of sampled cells with one point each, (C, D D, R) in float32.
+
+    H is the gradient of u (N, D), A = dP/dF, and G (C, D D, R) has the gradients of the basis,
+    rows D i + J. The gradients dN are (C, 1, A, D), the volumes dV (C, 1), and the constants of the
+    law (C, n), or (1, n) for all cells.
+    """
+    dim, rank = u.shape[1], basis.shape[2]
+    H, A, rest, constants = rows(9), rows(point.PAIRS), rows(point.PAIRS), rows(c.shape[1])
+    for start in range(0, len(cells), SIMD_WIDTH):
+        count = min(SIMD_WIDTH, len(cells) - start)
+        gather_constants(c, start, count, constants)
+        H[:] = 0.0
+        set_moduli(law, constants, finite, H, rest)
+        for lane in range(SIMD_WIDTH):
+            cell = start + min(lane, count - 1)
+            for a in range(cells.shape[1]):
+                for i in range(dim):
+                    for j in range(dim):
+                        H[3 * i + j, lane] += u[cells[cell, a], i] * dN[cell, 0, a, j]
+        set_moduli(law, constants, finite, H, A)
+        for lane in range(count):
+            for i in range(dim):
+                for J in range(dim):
+                    row = out[start + lane, dim * i + J]
+                    row[:] = 0
+                    for k in range(dim):
+                        for L in range(dim):
+                            at = point.PAIR[3 * i + J, 3 * k + L]
+                            weight = dV[start + lane, 0]
+                            change = np.float32(weight * (A[at, lane] - rest[at, lane]))
+                            other = basis[start + lane, dim * k + L]
+                            for r in range(rank):
+                                row[r] += change * other[r]

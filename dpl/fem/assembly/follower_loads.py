@@ -21,6 +21,7 @@ from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin
 from dpl.fem.ranges import ParameterRange, is_range
 from dpl.fem.units import Units
+from dpl.system.checks import named_errors
 
 Stress = float | Sequence[float] | Mapping[str, float | str]  # number or range
 ASYMMETRIC = 1e-10  # part of the largest entry above which a skew part is no rounding [-]
@@ -38,11 +39,6 @@ class FollowerLoad:
     direction_hint: ClassVar[str]  # says why `value` is no vector
     value: Stress
     name: str | None
-
-    @property
-    def parameter(self) -> str:
-        """Name of the parameter of a range."""
-        return self.name or self.default_name
 
     def stress(self, units: Units) -> tuple[float, ParameterRange | None]:
         """Return the stress over E [-], and None; NaN and its range [Pa] if loads decide it."""
@@ -167,15 +163,13 @@ class FollowerLoads:
         ranges: dict[str, ParameterRange] = {}
         values, parts = [], []
         for load in loads:
-            name = load.parameter
-            try:
+            name = load.name or load.default_name
+            with named_errors(f"follower_loads.{name}: "):
                 stress, ends = load.stress(units)
                 if ends and name in (*ranges, *material.parameter_ranges):
                     raise ValueError(f"two ranges have the name {name}; set another")
                 values.append(stress)
                 parts.append(load.on(basis, units, material, origin))
-            except ValueError as error:
-                raise ValueError(f"follower_loads.{name}: {error}") from error
             if ends:
                 ranges[name] = ends
         return cls(tuple(parts), torch.tensor([values], dtype=torch.float64), ranges)

@@ -83,14 +83,16 @@ class PressureSurface(LoadedPart):
         cells = mesh.f2t[0, facets]
         side = (mesh.t2f[:, cells] == facets).argmax(axis=0)  # number of the facet in its cell
         rules = [_facet_rule(basis, local) for local in range(len(mesh.t2f))]
-        nodes, weights, slopes = (np.stack([rule[k] for rule in rules])[side] for k in range(3))
+        nodes, weights, slopes, sense = (np.stack(part)[side] for part in zip(*rules, strict=True))
         nodes = np.take_along_axis(basis.element_dofs[:, cells].T, nodes, axis=1)
         X = np.zeros((*nodes.shape, 3))
         X[..., : mesh.dim()] = basis.doflocs.T[nodes]
         tangents = np.einsum("sqai,sac->sqci", slopes, X)
         if mesh.dim() == 2:
             tangents[..., 2, 1] = 1.0
-        outward = _orientation(basis, cells, side)[:, None, None]
+        centre = mesh.elem.refdom.p.mean(axis=1)[:, None]
+        J = mesh.mapping().detDF(centre, tind=cells)
+        outward = (sense[:, None] * np.sign(J))[:, None]
         tangents[..., 1] *= outward
         slopes[..., 1] *= outward
         return cls(
@@ -157,49 +159,30 @@ class PressureSurface(LoadedPart):
         return self._sum_at_nodes(forces, displacement)
 
 
-def _corners(basis: skfem.Basis, local: int) -> NDArray[np.float64]:
-    """Return the first corner and the edges from there of a facet of the reference cell, (D, D)."""
-    cell = basis.mesh.elem.refdom
-    first, second, *_, last = [cell.p[:, k] for k in (*cell.facets[local], cell.facets[local][-1])]
-    edges = [second - first, last - first][: len(first) - 1]
-    return np.stack([first, *edges], axis=-1).astype(np.float64)
-
-
 def _facet_rule(
     basis: skfem.Basis, local: int
-) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
-    """Return numbers of nodes, weights and slopes of a facet of the reference cell.
+) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64], float]:
+    """Return numbers of nodes, weights, slopes and the sense of a facet of the reference cell.
 
     They are the numbers (A,) of the nodes in the cell, the shape functions times the weights of the
-    quadrature (Q, A), and their derivatives along the edges (Q, A, 2).
+    quadrature (Q, A), their derivatives along the edges (Q, A, 2), and 1 where the product of the
+    edges points out of the cell, else -1.
     """
-    element, corners = basis.elem, _corners(basis, local)
-    facet = basis.mesh.elem.refdom.brefdom
-    order = DEGREES[facet.__name__][type(element) in QUADRATIC]
-    points, weights = skfem.quadrature.get_quadrature(facet, order)
-    at = corners[:, :1] + corners[:, 1:] @ points
+    element, cell = basis.elem, basis.mesh.elem.refdom
+    order = DEGREES[cell.brefdom.__name__][type(element) in QUADRATIC]
+    points, weights = skfem.quadrature.get_quadrature(cell.brefdom, order)
+    corners = cell.p[:, cell.facets[local]].astype(np.float64)
+    first = corners[:, :1]
+    edges = (corners[:, [1, -1]] - first)[:, : len(first) - 1]
+    at = first + edges @ points
     shapes = [element.lbasis(at, a) for a in range(basis.Nbfun)]
     values = np.stack([np.broadcast_to(value, weights.shape) for value, _ in shapes], axis=-1)
     slopes = np.zeros((*values.shape, 2))
     for a, (_, gradient) in enumerate(shapes):
-        gradient = np.broadcast_to(gradient, at.shape)
-        slopes[:, a, : len(at) - 1] = gradient.T @ corners[:, 1:]
+        slopes[:, a, : len(at) - 1] = np.broadcast_to(gradient, at.shape).T @ edges
     # nodes of a facet are those whose shape functions do not vanish on it
     on = np.flatnonzero(np.abs(values).max(axis=0) > 1e-12)
-    return on, values[:, on] * weights[:, None], slopes[:, on]
-
-
-def _orientation(
-    basis: skfem.Basis, cells: NDArray[np.int_], side: NDArray[np.int_]
-) -> NDArray[np.float64]:
-    """Return 1 where the product of the tangents points out of the cell, else -1, (S,)."""
-    mesh = basis.mesh
-    centre = mesh.elem.refdom.p.mean(axis=1)
-    senses = []
-    for local in range(len(mesh.t2f)):
-        first, *edges = _corners(basis, local).T
-        senses.append(np.linalg.det(np.stack([*edges, first - centre], axis=-1)))
-    J = mesh.mapping().detDF(centre[:, None].astype(np.float64), tind=cells)[:, 0]
+    sense = np.sign(np.linalg.det(np.hstack([edges, first - cell.p.mean(axis=1)[:, None]])))
     # in 2D the second tangent is normal to the plane: t1 x e_z is t1, turned clockwise
-    flip = -1.0 if mesh.dim() == 2 else 1.0
-    return flip * np.sign(np.array(senses)[side]) * np.sign(J)
+    sense = sense if len(at) == 3 else -sense
+    return on, values[:, on] * weights[:, None], slopes[:, on], sense

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dpl.fem.assembly import element_loops, lanes
 from dpl.fem.assembly.mean_dilatation import CellVolumes
-from dpl.fem.assembly.numba_laws import Law, required_terms
+from dpl.fem.assembly.numba_laws import Law
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.material import Material
 
@@ -31,11 +31,15 @@ AFFINE = 1e-13  # relative change of the inverse Jacobian in a cell that counts 
 
 
 class Kernels:
-    """Compiled loops over cells of one law, see `dpl.fem.assembly.element_loops`."""
+    """Compiled loops over cells of one law, see `dpl.fem.assembly.element_loops` and `with_law`."""
+
+    constants: Array  # of the law
+    _law: tuple[Law, float]  # and 1 for finite strains, else 0
+    _frames: Array
+    _bulk: Array | None = None
 
     def __init__(
         self,
-        material: Material,
         cells: NDArray[np.int64],
         reference: Array,
         dN: Array,
@@ -48,7 +52,6 @@ class Kernels:
         They are copies because sending a problem to a worker moves the memory of its tensors.
 
         Args:
-            material: A law that has a `compiled_form`.
             cells: Nodes of each cell, (E, A).
             reference: Gradients of the shape functions of the reference element, (Q, A, D).
             dN: Those of the cells, (E or 1, Q, A, D), reference times inverse Jacobian.
@@ -77,28 +80,16 @@ class Kernels:
         spare = np.arange(blocks[0].size, dtype=np.uint32).reshape(blocks[0].shape) % SPARE
         self.places = np.where(blocks == nnz, nnz + spare, blocks)
         self._n_cells = len(cells)
-        self._law: Any = None
-        self._set_law(material)
-
-    def _set_law(self, material: Material) -> None:
-        form = material.compiled_form
-        assert form is not None
-        law = Law.of(form, element_loops.SOURCES)
-        if self._law is None or self._law[0] != law:
-            volumetric = self._volumes is not None and material.finite
-            needs = max(required_terms(form), int(volumetric))
-            self._law = law, needs, float(material.finite)
-        self.constants = as_columns(material.constants)
-        self._frames = frames_of(material)
-        self._bulk = None
-        if self._volumes is not None:
-            self._bulk = as_columns([self._volumes.point_bulk(material)])
 
     def with_law(self, material: Material) -> "Kernels":
-        """Return the loops of another law over the same cells."""
-        other = copy.copy(self)
-        other._set_law(material)
-        return other
+        """Return the loops of a law that has a `compiled_form` over the same cells."""
+        loops, form = copy.copy(self), material.compiled_form
+        assert form is not None
+        loops._law = Law.of(form, element_loops.SOURCES), float(material.finite)
+        loops.constants, loops._frames = as_columns(material.constants), frames_of(material)
+        if self._volumes is not None:
+            loops._bulk = as_columns([self._volumes.point_bulk(material)])
+        return loops
 
     def add(
         self, u: Array, force: Array, values: Array, *, gap: Gap = NO_GAP, member: int = 0
@@ -108,13 +99,13 @@ class Kernels:
         Returns min det F, with a gap min det C of the mixed points. Members of a batch may have
         their own moduli.
         """
-        law, needs, finite = self._law
+        law, finite = self._law
         moduli, volumes = self.constants[member if len(self.constants) > 1 else 0], None
         if self._bulk is not None:
             volumes = self.functions, self._bulk[member if len(self._bulk) > 1 else 0]
-        law_arguments = law, moduli, self._frames, needs, finite
-        arguments = *law_arguments, u, gap, *self._body, volumes, self.places, force, values
-        return 1 + call_compiled(element_loops.add_system, *arguments)
+        arguments = *self._body, volumes, self.places, force, values
+        kernel, given = element_loops.add_system, (law, moduli, self._frames, finite)
+        return 1 + call_compiled(kernel, *given, u, gap, *arguments)
 
     @property
     def _body(self) -> tuple[Any, ...]:

@@ -42,7 +42,7 @@ class CellVolumes(NamedTuple):
     """Polynomials of the volume change in the cells of a body.
 
     Attributes:
-        functions: Their values, orthonormal in each cell, (E or 1, Q, M).
+        functions: Their values, orthonormal in each cell, (E or 1, Q, M), see `polynomials`.
         dV: Volumes of the quadrature points, (E or 1, Q) [-].
         point_shear: Part of the shear modulus that stays at the points as a bulk modulus [-].
     """
@@ -50,18 +50,6 @@ class CellVolumes(NamedTuple):
     functions: Tensor
     dV: Tensor
     point_shear: float = 0.0
-
-    @classmethod
-    def of(cls, points: Tensor, dV: Tensor, *, linear: bool) -> "CellVolumes":
-        """Return constants, or with `linear` linear functions, in cells.
-
-        The quadrature points are (E or 1, Q, D) [-], their volumes dV (E or 1, Q) [-].
-        """
-        one = torch.ones_like(dV)[..., None]
-        offsets = points - points.mean(1, keepdim=True)
-        columns = torch.cat([one, offsets], dim=-1) if linear else one
-        root = dV.sqrt()[..., None]
-        return cls((torch.linalg.qr(root * columns).Q / root).contiguous(), dV)
 
     def point_bulk(self, material: Material) -> Tensor:
         """Return the bulk modulus over E that stays at the points [-]."""
@@ -83,6 +71,18 @@ class CellVolumes(NamedTuple):
         """Return the matrices of a factor (B, E, Q) between functions, (B, E, M, M)."""
         weighted = self.functions * (values * self.dV)[..., None]
         return weighted.mT @ self.functions
+
+
+def polynomials(points: Tensor, dV: Tensor, *, linear: bool) -> Tensor:
+    """Return constants, or with `linear` linear functions, orthonormal in cells, (E or 1, Q, M).
+
+    The quadrature points are (E or 1, Q, D) [-], their volumes dV (E or 1, Q) [-].
+    """
+    one = torch.ones_like(dV)[..., None]
+    offsets = points - points.mean(1, keepdim=True)
+    columns = torch.cat([one, offsets], dim=-1) if linear else one
+    root = dV.sqrt()[..., None]
+    return (torch.linalg.qr(root * columns).Q / root).contiguous()
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,18 +110,15 @@ class PointwiseLaw:
         """Return the parts of the tangent, see `Tangent`."""
         return (self.material.tangent(H),)
 
-    def mixed_system(self, H: Tensor, gap: Any) -> tuple[Tensor, Tangent]:
-        """Return stress and tangent with mixed integration points.
+    def mixed_system(self, H: Tensor, gap: Any) -> tuple[Tensor, Tangent, Tensor]:
+        """Return stress, tangent, and the least det C - 1 (B,) [-], of mixed integration points.
 
         Source: Magisano, Leonetti, Garcea (2017), CMAME 313, section 3.
         """
-        response = self.material.response(green_lagrange(H) - gap)
+        strain = green_lagrange(H) - gap
+        response = self.material.response(strain)
         S = response.stress + response.product(gap)
-        return S + H @ S, (response.tangent(H),)
-
-    def lowest_change(self, H: Tensor, gap: Any) -> Tensor:
-        """Return the least det C - 1 of the mixed points, (B,) [-]."""
-        return volume_change(2 * (green_lagrange(H) - gap)).flatten(1).amin(1)
+        return S + H @ S, (response.tangent(H),), volume_change(2 * strain).flatten(1).amin(1)
 
     def gap_after(self, gap: Any, length: float, update: Tensor, H: Tensor | None) -> Any:
         """Return the gap after length * update, gradients as H, see `Problem.update_strain_gap`.
@@ -171,18 +168,18 @@ class MeanDilatation(PointwiseLaw):
             A = A + _at_moduli(volumes.project(mean) - own) * curvature
         return A, slope, volumes.matrices(mean_modulus)
 
-    def mixed_system(self, H: Tensor, gap: MixedGap) -> tuple[Tensor, Tangent]:
-        """Return stress and tangent with mixed integration points.
+    def mixed_system(self, H: Tensor, gap: MixedGap) -> tuple[Tensor, Tangent, Tensor]:
+        """Return stress, tangent, and the least det C - 1 or J - 1 of points and cells.
 
         Each cell eliminates the coefficients of a volume change and of a pressure, each point a
         strain, on which all but the volumetric energy depends. The equations are linear in the
         pressure, so that the number of iterations does not grow with the bulk modulus.
         """
         E, volumes = green_lagrange(H), self.volumes
-        law = self._without_volume(E - gap.strain)
-        change = volume_change(H)
-        mean = volumes.coefficients(change) - gap.volume
-        p, modulus = self._pressure_and_modulus(volumes.at_points(mean))
+        strain, change = E - gap.strain, volume_change(H)
+        law = self._without_volume(strain)
+        mean = volumes.at_points(volumes.coefficients(change) - gap.volume)
+        p, modulus = self._pressure_and_modulus(mean)
         ahead = p + modulus * volumes.at_points(gap.volume)
         X = inverse_transpose(2 * E, invariants(2 * E)[2])
         unit = Response((1 + change)[..., None, None] * X, _volume_moduli(X, 1 + change))
@@ -191,13 +188,9 @@ class MeanDilatation(PointwiseLaw):
         at_points = Response(
             law.stress + p[..., None, None] * unit.stress, law.moduli + _at_moduli(p) * unit.moduli
         )
-        return S + H @ S, (at_points.tangent(H), self._slope(H), volumes.matrices(modulus))
-
-    def lowest_change(self, H: Tensor, gap: MixedGap) -> Tensor:
-        """Return the least det C - 1 of the mixed points and J - 1 of the cells, (B,) [-]."""
-        volumes = self.volumes
-        mean = volumes.at_points(volumes.coefficients(volume_change(H)) - gap.volume)
-        return torch.minimum(super().lowest_change(H, gap.strain), mean.flatten(1).amin(1))
+        lowest = torch.minimum(volume_change(2 * strain), mean).flatten(1).amin(1)
+        parts = at_points.tangent(H), self._slope(H), volumes.matrices(modulus)
+        return S + H @ S, parts, lowest
 
     def gap_after(
         self, gap: MixedGap | None, length: float, update: Tensor, H: Tensor | None

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import numpy as np
-import torch
 from numba import types
 from numba.extending import NativeValue, models, overload, register_model, typeof_impl, unbox
 
@@ -56,11 +54,8 @@ def _law(parts: tuple[tuple[type[Any], int], ...], sources: str) -> Law:
     name = "".join(kind.__qualname__ for kind, _ in parts) + digest
     if name not in _COMPILED:
         invariants, *compiled = map(_compile, functions)
-        rows = [range(at, at + count) for _, count in fibres]
-        _COMPILED[name] = (
-            _call_of_invariants(invariants, at),
-            _call_of_fibres(compiled[0], rows[0]) if fibres else None,
-        )
+        calls = [_call_of_fibres(compiled[0], range(at, at + count)) for _, count in fibres]
+        _COMPILED[name] = _call_of_invariants(invariants, at), calls[0] if calls else None
     return Law(_LawType(name))
 
 
@@ -89,23 +84,6 @@ def _call_of_fibres(function: Any, rows: range) -> Any:
     scope = {"function": function, "load": load, "store": store}
     exec("\n".join(lines), scope)  # of numbers only
     return scope["call"]
-
-
-def required_terms(form: CompiledForm) -> int:
-    """Return the terms that a law needs: 0 no C^-1, 1 C^-1, 2 also ln J, 3 also J^(-2/3)."""
-    law = form.isotropic
-    constants = tuple(float(torch.as_tensor(c).flatten()[0]) for c in law.constants)
-
-    def evaluate(**values: float) -> tuple[float, ...]:
-        arguments = dict.fromkeys(("i1", "i2", "j", "log_j", "m1"), 0.0) | values
-        return law.invariant_derivatives(constants, **arguments)
-
-    if np.isnan(evaluate(m1=np.nan)).any():
-        return 3
-    if np.isnan(evaluate(log_j=np.nan)).any():
-        return 2
-    everything = evaluate(i1=np.nan, i2=np.nan, j=np.nan)
-    return 0 if everything[2] == 0 and not np.any(everything[6:]) else 1
 
 
 def _globals(function: Any) -> dict[str, Any]:

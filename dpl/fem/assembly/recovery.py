@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
 Array = NDArray[np.float64]
@@ -56,9 +56,11 @@ class Recovery:
         count, quadrature = dV.shape
         all_points = at.reshape(-1, at.shape[-1]), dV.ravel()
         own = np.repeat(np.arange(count), cells.shape[1])
-        adjacent = _pattern(cells.ravel(), own, (len(points), count))
-        cell = np.repeat(np.arange(count), quadrature)
-        members = _pattern(cell, np.arange(cell.size), (count, cell.size))
+        pairs = np.ones(cells.size), (cells.ravel(), own)
+        adjacent = csr_array(pairs, shape=(len(points), count))
+        members = csr_array(
+            (np.ones(dV.size), np.arange(dV.size), np.arange(count + 1) * quadrature)
+        )
         if degree == 2:
             return cls(_fit(all_points, _product(adjacent, members), points)[0], quadrature)
         patches = _patches(adjacent, boundary)
@@ -69,7 +71,7 @@ class Recovery:
         matrix = matrix @ csr_array((shares.ravel(), members.indices, members.indptr))
         if quadrature > 1 and not determined.all():
             refined = _fit(all_points, _product(patches, members), points)[0]
-            matrix = _diagonal(determined) @ matrix + _diagonal(~determined) @ refined
+            matrix = matrix.multiply(determined[:, None]) + refined.multiply(~determined[:, None])
         return cls(csr_array(matrix), quadrature)
 
     def restricted_to(self, nodes: NDArray[np.int64]) -> tuple[NDArray[np.int64], "Recovery"]:
@@ -89,10 +91,8 @@ class Recovery:
     @cached_property
     def _tensor(self) -> Tensor:
         matrix = self.matrix
-        starts, columns = (
-            torch.from_numpy(part.astype(np.int64)) for part in (matrix.indptr, matrix.indices)
-        )
-        weights = torch.from_numpy(matrix.data)
+        parts = matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), matrix.data
+        starts, columns, weights = map(torch.from_numpy, parts)
         with warnings.catch_warnings(), torch.inference_mode(False):  # also for derivatives
             warnings.simplefilter("ignore")  # sparse matrices of torch are in beta state
             return torch.sparse_csr_tensor(starts, columns, weights, matrix.shape)
@@ -101,11 +101,12 @@ class Recovery:
 def _patches(adjacent: csr_array, boundary: NDArray[np.bool_]) -> csr_array:
     """Return the cells of the patch of each node, (N, E), from the cells at each node, (N, E)."""
     neighbours = _product(adjacent, csr_array(adjacent.T))
-    interior = csr_array(neighbours @ _diagonal(~boundary))
+    interior = csr_array(neighbours.multiply(~boundary[None]))
     interior.eliminate_zeros()
     alone = np.diff(interior.indptr) == 0
-    through = interior + _diagonal(alone) @ neighbours
-    return _product(csr_array(_diagonal(boundary) @ through + _diagonal(~boundary)), adjacent)
+    through = interior + neighbours.multiply(alone[:, None])
+    own = diags_array((~boundary).astype(np.float64))
+    return _product(csr_array(through.multiply(boundary[:, None]) + own), adjacent)
 
 
 def _fit(
@@ -134,20 +135,9 @@ def _fit(
     return csr_array((weight, column, patches.indptr), shape=patches.shape), np.all(known, axis=1)
 
 
-def _pattern(
-    rows: NDArray[np.int64], columns: NDArray[np.int64], shape: tuple[int, int]
-) -> csr_array:
-    return csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)
-
-
 def _product(left: csr_array, right: csr_array) -> csr_array:
     """Return the pattern of a product of patterns, with sorted columns."""
     found = csr_array(left @ right)
     found.eliminate_zeros()
     found.sort_indices()
     return found
-
-
-def _diagonal(mask: NDArray[np.bool_]) -> csr_array:
-    chosen = np.flatnonzero(mask)
-    return _pattern(chosen, chosen, (len(mask), len(mask)))

@@ -5,8 +5,10 @@ register. `load` and `store` transfer rows of arrays (rows, SIMD_WIDTH); the ope
 vectors and numbers.
 """
 
+import inspect
 import math
 import operator
+from collections.abc import Callable
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -89,68 +91,67 @@ def store(typing: Any, array: Any, row: Any, value: Any) -> Any:
     return types.void(array, row, value), code
 
 
-def _call(builder: Any, name: str, args: Any) -> Any:
+def _vector(context: Any, builder: Any, value: Any, kind: Any) -> Any:
+    """Return a value as a vector, a number repeated in every lane."""
+    if isinstance(kind, SIMDVector):
+        return value
+    nothing = ir.Constant(_VECTOR, ir.Undefined)
+    number = context.cast(builder, value, kind, types.float64)
+    first = builder.insert_element(nothing, number, ir.Constant(ir.IntType(32), 0))
+    everywhere = ir.Constant(ir.VectorType(ir.IntType(32), SIMD_WIDTH), [0] * SIMD_WIDTH)
+    return builder.shuffle_vector(first, nothing, everywhere)
+
+
+def _integers(value: int) -> Any:
+    """Return an integer in every lane."""
+    return ir.Constant(_INTEGERS, [value] * SIMD_WIDTH)
+
+
+def _lanewise(emit: Callable[..., Any]) -> Any:
+    """Return an intrinsic of vectors, and numbers in every lane, from the code that it emits."""
+
+    def apply(typing: Any, *kinds: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            pairs = zip(args, signature.args, strict=True)
+            return emit(builder, *(_vector(context, builder, *pair) for pair in pairs))
+
+        return SIMD_VECTOR(*kinds), code
+
+    apply.__signature__ = inspect.signature(emit)  # type: ignore[attr-defined]
+    return intrinsic(apply)
+
+
+def _call(builder: Any, name: str, *args: Any) -> Any:
     """Return the result of one of LLVM's functions of vectors."""
     kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(args))
     name = f"llvm.{name}.v{SIMD_WIDTH}f64"
     return builder.call(builder.module.declare_intrinsic(name, (), kind), args)
 
 
-def _function(name: str) -> Any:
-    """Return one of LLVM's functions of one vector, by lanes."""
-
-    @intrinsic
-    def apply(typing: Any, x: Any) -> Any:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return _call(builder, name, args)
-
-        return SIMD_VECTOR(x), code
-
-    return apply
+sqrt = _lanewise(lambda builder, x: _call(builder, "sqrt", x))
+_exp = _lanewise(lambda builder, x: _call(builder, "exp", x))
+_rint = _lanewise(lambda builder, x: _call(builder, "rint", x))
+_fma = _lanewise(lambda builder, x, y, z: _call(builder, "fma", x, y, z))
 
 
-sqrt, _exp, _rint = map(_function, ("sqrt", "exp", "rint"))
-
-
-@intrinsic
-def _fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _call(builder, "fma", _vectors(context, builder, signature, args))
-
-    return SIMD_VECTOR(x, y, z), code
-
-
-@intrinsic
-def _exponent(typing: Any, x: Any) -> Any:
+@_lanewise
+def _exponent(builder: Any, x: Any) -> Any:
     """Return the exponent of 2 of each lane, a positive number."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bits = builder.lshr(builder.bitcast(args[0], _INTEGERS), _integers(52))
-        return builder.sitofp(builder.sub(bits, _integers(1023)), _VECTOR)
-
-    return SIMD_VECTOR(x), code
+    bits = builder.lshr(builder.bitcast(x, _INTEGERS), _integers(52))
+    return builder.sitofp(builder.sub(bits, _integers(1023)), _VECTOR)
 
 
-@intrinsic
-def _power_of_two(typing: Any, x: Any) -> Any:
+@_lanewise
+def _power_of_two(builder: Any, x: Any) -> Any:
     """Return 2^x of each lane, a whole number above -1023 and below 1024."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        whole = builder.add(builder.fptosi(args[0], _INTEGERS), _integers(1023))
-        return builder.bitcast(builder.shl(whole, _integers(52)), _VECTOR)
-
-    return SIMD_VECTOR(x), code
+    whole = builder.add(builder.fptosi(x, _INTEGERS), _integers(1023))
+    return builder.bitcast(builder.shl(whole, _integers(52)), _VECTOR)
 
 
-@intrinsic
-def choose(typing: Any, x: Any, y: Any, below: Any, other: Any) -> Any:
+@_lanewise
+def choose(builder: Any, x: Any, y: Any, below: Any, other: Any) -> Any:
     """Return `below` in lanes with x < y, and `other` elsewhere, also where x or y is NaN."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        x, y, below, other = _vectors(context, builder, signature, args)
-        return builder.select(builder.fcmp_ordered("<", x, y), below, other)
-
-    return SIMD_VECTOR(x, y, below, other), code
+    return builder.select(builder.fcmp_ordered("<", x, y), below, other)
 
 
 @inlined
@@ -194,69 +195,24 @@ def _overloaded_nonzero(x):
     return (lambda x: True) if isinstance(x, SIMDVector) else (lambda x: x != 0.0)
 
 
-@overload(arithmetic.exp)
-def _overloaded_exp(x):
-    return lambda x: _exp(x)
-
-
-@overload(arithmetic.positive_part)
-def _overloaded_positive_part(x):
-    return lambda x: choose(x, 0.0, 0.0, x)  # NaN stays
-
-
-@overload(arithmetic.step)
-def _overloaded_step(x):
-    return lambda x: choose(x, 0.0, 0.0, 1.0)
-
-
-def _vector(context: Any, builder: Any, value: Any, kind: Any) -> Any:
-    """Return a value as a vector, a number repeated in every lane."""
-    if isinstance(kind, SIMDVector):
-        return value
-    nothing = ir.Constant(_VECTOR, ir.Undefined)
-    number = context.cast(builder, value, kind, types.float64)
-    first = builder.insert_element(nothing, number, ir.Constant(ir.IntType(32), 0))
-    everywhere = ir.Constant(ir.VectorType(ir.IntType(32), SIMD_WIDTH), [0] * SIMD_WIDTH)
-    return builder.shuffle_vector(first, nothing, everywhere)
-
-
-def _vectors(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    """Return the arguments of an intrinsic as vectors."""
-    pairs = zip(args, signature.args, strict=True)
-    return [_vector(context, builder, value, kind) for value, kind in pairs]
-
-
-def _integers(value: int) -> Any:
-    """Return an integer in every lane."""
-    return ir.Constant(_INTEGERS, [value] * SIMD_WIDTH)
+overload(arithmetic.exp)(lambda x: lambda x: _exp(x))
+overload(arithmetic.positive_part)(lambda x: lambda x: choose(x, 0.0, 0.0, x))  # NaN stays
+overload(arithmetic.step)(lambda x: lambda x: choose(x, 0.0, 0.0, 1.0))
 
 
 def _operator(function: Any, instruction: str) -> None:
-    @intrinsic
-    def apply(typing: Any, x: Any, y: Any) -> Any:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            vectors = _vectors(context, builder, signature, args)
-            return getattr(builder, instruction)(*vectors, flags=_FLAGS)
-
-        return SIMD_VECTOR(x, y), code
+    apply = _lanewise(lambda builder, x, y: getattr(builder, instruction)(x, y, flags=_FLAGS))
 
     @overload(function)
     def of(x, y):
         kinds = (types.Float, types.Integer, SIMDVector)
         both = isinstance(x, kinds) and isinstance(y, kinds)
-        if both and (isinstance(x, SIMDVector) or isinstance(y, SIMDVector)):
-            return lambda x, y: apply(x, y)
-        return None
+        is_vector = isinstance(x, SIMDVector) or isinstance(y, SIMDVector)
+        return (lambda x, y: apply(x, y)) if both and is_vector else None
 
 
 _operator(operator.add, "fadd")
 _operator(operator.sub, "fsub")
 _operator(operator.mul, "fmul")
 _operator(operator.truediv, "fdiv")
-
-
-@overload(operator.neg)
-def _negative(x):
-    if isinstance(x, SIMDVector):
-        return lambda x: 0.0 - x
-    return None
+overload(operator.neg)(lambda x: (lambda x: 0.0 - x) if isinstance(x, SIMDVector) else None)

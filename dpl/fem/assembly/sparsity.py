@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 Integers = NDArray[np.int64]
 
@@ -30,21 +31,28 @@ class Pattern:
     @classmethod
     def build(cls, cells: Integers, free: NDArray[np.bool_]) -> "Pattern":
         """Return the pattern of cells (E, A) with a mask of free degrees of freedom (N, D)."""
-        nodes = len(free)
+        nodes, size = len(free), int(free.sum())
+        number = np.full(free.shape, -1)
+        number[free] = np.arange(size)
         b, a = np.tril_indices(cells.shape[1])
         p, q = cells[:, a], cells[:, b]
         codes, entry = np.unique(np.minimum(p, q) * nodes + np.maximum(p, q), return_inverse=True)
-        place, indptr, indices = _places(codes // nodes, codes % nodes, free)
+        low, high = number[codes // nodes], number[codes % nodes]
+        row, column = np.broadcast_arrays(low[:, :, None], high[:, None, :])  # (pairs, D, D)
+        stored = (row >= 0) & (row <= column)
+        nnz = np.count_nonzero(stored)
+        at = row[stored], column[stored]
+        matrix = coo_array((np.arange(nnz), at), shape=(size, size)).tocsr()
+        matrix.sort_indices()
+        order = np.empty(nnz, dtype=np.int32)
+        order[matrix.data] = np.arange(nnz)
+        place = np.full(stored.shape, nnz, dtype=np.int32)
+        place[stored] = order
         places = place[entry.reshape(p.shape)]
         transposed = (p > q)[..., None, None]
         places = np.where(transposed, places.swapaxes(-1, -2), places)
-        return cls(
-            size=int(free.sum()),
-            indptr=indptr.astype(np.int32),
-            indices=indices.astype(np.int32),
-            places=places.astype(np.int32),
-            number=_numbered(free),
-        )
+        indptr, indices = (part.astype(np.int32) for part in (matrix.indptr, matrix.indices))
+        return cls(size, indptr, indices, places, number)
 
     def positions(self, row: Integers, column: Integers) -> Integers:
         """Return the positions of entries of pairs of degrees of freedom that belong to one cell.
@@ -55,38 +63,3 @@ class Pattern:
         codes = owner * self.size + self.indices
         found = np.searchsorted(codes, row * self.size + column)
         return np.where((row >= 0) & (row <= column), found, len(codes))
-
-
-def _numbered(free: NDArray[np.bool_]) -> Integers:
-    """Return the number of each free degree of freedom, -1 for fixed ones, (N, D)."""
-    number = np.full(free.shape, -1)
-    number[free] = np.arange(free.sum())
-    return number
-
-
-def _places(
-    low: Integers, high: Integers, free: NDArray[np.bool_]
-) -> tuple[Integers, Integers, Integers]:
-    """Return positions (T, D, D) of the T pairs of nodes low <= high, indptr and indices.
-
-    The pairs are sorted, and contain each node with itself.
-    """
-    nodes, dim = free.shape
-    width = free.sum(axis=1)  # free components of a node
-    rank = free.cumsum(axis=1) - free  # number of free components before each one
-    number = _numbered(free)
-    same = low == high
-    before = np.concatenate([[0], np.cumsum(width[high])])
-    row_start = before[np.searchsorted(low, np.arange(nodes + 1))]
-    lengths = np.diff(row_start)[:, None] - rank  # of the rows of each node
-    indptr = np.concatenate([[0], np.cumsum(lengths[free])])
-    first = np.zeros(free.shape, dtype=np.int64)
-    first[free] = indptr[:-1]
-    offset = before[:-1] - row_start[low]  # of each pair in the first row of its node
-    place = (first - rank)[low][:, :, None] + offset[:, None, None] + rank[high][:, None, :]
-    kept = free[low][:, :, None] & free[high][:, None, :]
-    kept &= ~(same[:, None, None] & np.tri(dim, k=-1, dtype=bool))
-    indices = np.empty(indptr[-1], dtype=np.int64)
-    columns = np.broadcast_to(number[high][:, None, :], place.shape)
-    indices[place[kept]] = columns[kept]
-    return np.where(kept, place, len(indices)), indptr, indices

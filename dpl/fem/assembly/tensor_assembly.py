@@ -62,18 +62,6 @@ class TensorAssembly:
         """Return the Green-Lagrange strain at the quadrature points, (B, E, Q, 3, 3) [-]."""
         return green_lagrange(self.body.gradient(displacement))
 
-    def mixed_system(self, displacement: Tensor, gap: Any) -> tuple[Tensor, Tensor]:
-        """Return force (B, N, D) and tangent (B, nnz) with mixed integration points (MIP).
-
-        The strain at each quadrature point is an independent unknown, which the point eliminates.
-        Stress and moduli are evaluated at the strain of u minus the gap, and the stress is
-        extrapolated linearly to the strain of u. With a zero gap the results are `internal_force`
-        and `tangent`. With mean dilatation volume changes and pressures of the cells are unknowns
-        too.
-        """
-        stress, parts = self.law.mixed_system(self.body.gradient(displacement), gap)
-        return self.body.nodal_forces(stress), self.body.entries(*parts)
-
     @torch.no_grad()
     def evaluate(self, displacement: Tensor) -> tuple[Tensor, Tensor]:
         """Return internal force (B, N, D) and min det F (B,)."""
@@ -81,12 +69,21 @@ class TensorAssembly:
 
     @torch.no_grad()
     def linearise(self, displacement: Tensor, gap: Any) -> tuple[Tensor, Tensor, Tensor]:
-        """Return force (B, N, D), tangent (B, nnz) and min det C of the mixed points (B,)."""
+        """Return force (B, N, D), tangent (B, nnz) and min det C of the mixed points (B,).
+
+        The strain at each mixed integration point is an independent unknown, which the point
+        eliminates. Stress and moduli are evaluated at the strain of u minus the gap, and the stress
+        is extrapolated linearly to the strain of u. With mean dilatation volume changes and
+        pressures of the cells are unknowns too. With a zero gap, or without one, the results are
+        `internal_force` and `tangent`.
+        """
+        H = self.body.gradient(displacement)
         if gap is None:
-            force, tangent = self.internal_force(displacement), self.tangent(displacement)
-            return force, tangent, force.new_full(force.shape[:1], torch.inf)
-        force, tangent = self.mixed_system(displacement, gap)
-        return force, tangent, 1 + self.law.lowest_change(self.body.gradient(displacement), gap)
+            stress, parts = self.law.stress(H), self.law.tangent(H)
+            change = displacement.new_full((len(H),), torch.inf)
+        else:
+            stress, parts, change = self.law.mixed_system(H, gap)
+        return self.body.nodal_forces(stress), self.body.entries(*parts), 1 + change
 
     def update_strain_gap(
         self, gap: Any, length: float, update: Tensor, displacement: Tensor | None = None

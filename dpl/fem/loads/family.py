@@ -148,7 +148,7 @@ class RandomLoads(LoadFamily):
 
     @cached_property
     def moduli(self) -> ParameterRange:
-        return ParameterRange.of_young(self.young)
+        return ParameterRange.of("young", self.young, is_modulus=True)
 
     @property
     def parameter_ranges(self) -> Mapping[str, ParameterRange]:

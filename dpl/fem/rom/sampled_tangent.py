@@ -7,9 +7,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.assembly import reduced_loops
+from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.kernels import call_compiled, constants_of
-from dpl.fem.assembly.numba_laws import Law, required_terms
+from dpl.fem.assembly.numba_laws import Law
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.materials.material import Material
@@ -86,10 +86,9 @@ class SampledTangent:
         out = np.empty_like(self._basis)
         u = displacement.contiguous().numpy()
         call_compiled(
-            reduced_loops.moduli_change_product,
-            *(Law.of(form, reduced_loops.SOURCES), constants_of(law)[0]),
-            *(self._required_terms, float(law.finite)),
-            *(u, self._nodes, self._dN, self._dV, self._basis, out),
+            element_loops.moduli_change_product,
+            *(Law.of(form, element_loops.SOURCES), constants_of(law)[0]),
+            *(float(law.finite), u, self._nodes, self._dN, self._dV, self._basis, out),
         )
         return out
 
@@ -102,12 +101,6 @@ class SampledTangent:
         change = (law.tangent(H) - law.tangent(torch.zeros_like(H)))[0, :, 0]
         change = change[:, :dim, :dim, :dim, :dim].reshape(-1, dim * dim, dim * dim)
         return (change * torch.from_numpy(self._dV)[..., None]).float().numpy() @ self._basis
-
-    @cached_property
-    def _required_terms(self) -> int:
-        form = one_law(self.problem.reference.material).compiled_form
-        assert form is not None
-        return required_terms(form)
 
     @cached_property
     def _terms(self) -> tuple[StiffnessTerms, Array]:

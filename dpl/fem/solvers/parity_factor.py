@@ -40,7 +40,7 @@ class OrbitForm(NamedTuple):
 
     def parts(self, force: Tensor) -> Tensor:
         """Return the products of a force at free degrees of freedom, (n,), with fields, (M, m)."""
-        return self.orbits.by_parity(force, self.parities)
+        return torch.stack([self.orbits.products(force, one) for one in self.parities.characters])
 
     def matrices(self, problem: Problem) -> list[csr_array]:
         """Return C^T K(0) C, (m, m), of the fields C of each parity, one for each orbit.

@@ -9,18 +9,18 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from dpl.fem.assembly.kernels import constants_of
-from dpl.fem.assembly.numba_laws import Law, required_terms
+from dpl.fem.assembly.numba_laws import Law
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.parity import SignedOrbits
 from dpl.models.linear_response import LinearResponse
 from dpl.models.unrolled.loops import SOURCES, ModelArrays
 
-LawArguments = tuple[Law, NDArray[np.float64], int, float]
+LawArguments = tuple[Law, NDArray[np.float64], float]
 
 
 def law_arguments(law: InvariantBasedMaterial) -> LawArguments:
-    """Return a law as the first arguments of `predict`: key, constants, required terms, finite.
+    """Return a law as the first arguments of `predict`: key, constants, finite.
 
     Its constants are followed by mu and lambda, (1, n + 2) or (C, n + 2).
 
@@ -31,7 +31,7 @@ def law_arguments(law: InvariantBasedMaterial) -> LawArguments:
     count = max(map(len, rows))
     constants = np.concatenate([np.broadcast_to(row, (count, row.shape[1])) for row in rows], 1)
     key = Law.of(law.compiled_form, SOURCES)
-    return key, constants, required_terms(law.compiled_form), float(law.finite)
+    return key, constants, float(law.finite)
 
 
 def model_arrays(
@@ -56,7 +56,8 @@ def model_arrays(
 
     def by_parity(orbits: SignedOrbits, matrix: Tensor) -> Tensor:
         """Return the columns of a matrix (n, R) at one value of each orbit, (M, r, m)."""
-        parts = (orbits.of_parity(matrix, columns).mT for columns in own)
+        rows = torch.where(orbits.weight[:, None] > 0, matrix[orbits.images[0]], 0.0).mT
+        parts = (rows[columns] for columns in own)
         return torch.stack([pad(part, (0, 0, 0, most - len(part))) for part in parts])
 
     flat = gradients.flatten(1).T  # (C D D, R + 1)

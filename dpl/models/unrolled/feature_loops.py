@@ -55,7 +55,7 @@ def rotated_strain(H, out):
 
 
 @njit(error_model="numpy")
-def unbalanced_stress(law, c, needs, finite, H, linear, work, out):
+def unbalanced_stress(law, c, finite, H, linear, work, out):
     """Set out (18, width) to R^T dP and dP at H (9, width); H is overwritten.
 
     See `dpl.models.unrolled.features.unbalanced_stress`. The last two constants of c (n + 2, width)
@@ -69,7 +69,7 @@ def unbalanced_stress(law, c, needs, finite, H, linear, work, out):
             for r in range(9):
                 H[r, k] = 0.0
     point.strain(H, finite, e)
-    point.stress(law, c, needs, e, point.volume_change(H), X, S, D, False)
+    point.stress(law, c, e, point.volume_change(H), X, S, D, False)
     mu, lam = load(c, c.shape[0] - 2), load(c, c.shape[0] - 1)
     trace = load(linear, 0) + load(linear, 4) + load(linear, 8)
     for i in range(3):

@@ -141,7 +141,7 @@ def set_gradients(model, coordinates, parts, H):
 
 
 @njit(error_model="numpy")
-def nonlinear_coordinates(law, c, needs, finite, model, linear, sizes):
+def nonlinear_coordinates(law, c, finite, model, linear, sizes):
     """Return coordinates (R,) of the nonlinear displacement; the arguments are as in `predict`.
 
     `linear` (R,) are the coordinates of the Galerkin linear solution.
@@ -167,9 +167,7 @@ def nonlinear_coordinates(law, c, needs, finite, model, linear, sizes):
         set_gradients(model, linear + total, parts, H)
         for k in range(shape[0]):
             gather_constants(c, SIMD_WIDTH * k, SIMD_WIDTH, constants)
-            unbalanced_stress(
-                law, constants, needs, finite, present[k], linear_blocks[k], work, blocks[k]
-            )
+            unbalanced_stress(law, constants, finite, present[k], linear_blocks[k], work, blocks[k])
         split(characters, model.map_signs, stress, both)
         set_coordinates(model.columns, model.maps[i], both, step)
         sizes[i + 2] = limit_step(step, model.limits[i + 1] * sizes[i + 1])
@@ -178,11 +176,11 @@ def nonlinear_coordinates(law, c, needs, finite, model, linear, sizes):
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def predict(law, c, needs, finite, model, inverse, unit, parts, solution, field, sizes):
+def predict(law, c, finite, model, inverse, unit, parts, solution, field, sizes):
     """Set the field of a prediction.
 
     Args:
-        law, c, needs, finite: The law, see `dpl.models.unrolled.compiled.law_arguments`.
+        law, c, finite: The law, see `dpl.models.unrolled.compiled.law_arguments`.
         model: The arrays of the model.
         inverse: (V^T K(0) V)^-1, (R, R).
         unit, parts, solution: Force and linear solution by parity, see `LinearResponse.at`; the
@@ -194,6 +192,6 @@ def predict(law, c, needs, finite, model, inverse, unit, parts, solution, field,
     set_coordinates(model.columns, model.modes, parts, right)
     add_product(right, inverse, linear)  # no BLAS, whose threads wait for each other
     linear *= unit
-    found = nonlinear_coordinates(law, c, needs, finite, model, linear, sizes)
+    found = nonlinear_coordinates(law, c, finite, model, linear, sizes)
     add_fields(model.columns, found / unit, model.modes, solution)
     set_field(model.orbits, solution, unit, field)
