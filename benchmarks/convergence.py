@@ -101,7 +101,7 @@ def solvers_of(
 ) -> dict[tuple[str, str], Solver]:
     """Return the solvers to compare, by name and network; `REFERENCE` is always one of them."""
     robust, quick = (replace(one, tol=tol) for one in (scene.newton, scene.corrector))
-    plain = PlainNewton(robust)
+    plain: Any = PlainNewton(robust)  # has what the hybrid uses of Newton
     solvers: dict[tuple[str, str], Solver] = {
         ("plain Newton", ""): plain,
         ("plain Newton, load steps", ""): replace(
