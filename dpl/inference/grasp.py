@@ -21,7 +21,7 @@ from dpl.training import TrainedSurrogate
 
 CORRECTED_GAP = 1e-2  # error of a motion at which its prediction is corrected, over its size [-]
 CORRECTED_ITER = 3  # predictions for a motion if the last one is corrected
-ACCURATE = 1e-2  # estimated error from which a motion is made in more parts [-]
+ACCURATE = 3e-3  # estimated error from which a motion is made in more parts [-]
 PARTS = 1, 2, 4, 8  # factors on the number of parts, which follow each other
 MAX_PARTS = 32  # smallest number of parts of the largest rotations
 MAX_TURN = math.radians(30)  # largest rotation of a part of a motion [rad]

@@ -24,7 +24,7 @@ MOTION_TOL = 1e-3  # largest error of a motion that is accepted, over its size [
 MAX_ITER = 16  # predictions for a motion
 MEMORY = 8  # iterations from which Anderson's method extrapolates
 CORRECTED = 3e-5  # relative error of a displacement below which its correction ends [-]
-CORRECTED_WARM = 3e-4  # the same of the frames of a moving hand [-]
+CORRECTED_WARM = 1e-4  # the same of the frames of a moving hand [-]
 CONTRACTION = 0.5  # ratio of residuals below which a correction contracts [-]
 
 
