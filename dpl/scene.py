@@ -151,13 +151,6 @@ class Scene:
         """L^(D-1) [m^2 in 3D, m in 2D]: forces are this times E times the dimensionless ones."""
         return self.length ** (self.problem.shape[1] - 1)
 
-    @property
-    def has_boundary_values(self) -> bool:
-        """Return True if samples depend on a boundary value, over E or L, besides random loads."""
-        problem = self.problem
-        constant = self.loads.constant_force is not None
-        return constant or problem.has_one_modulus or problem.moved_supports
-
     def load_of(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Load:
         """Return nodal forces (B, N, D) [N] (2D: [N/m]) on bodies of moduli (B,) [Pa] as a load.
 

@@ -163,16 +163,6 @@ def extra(cfg: DictConfig, name: str) -> bool:
     return bool((cfg.get("extras") or {}).get(name))
 
 
-def check_extras(cfg: DictConfig) -> None:
-    """Raise a `ConfigError` if `extras` needs tags that are missing or a viewer that cannot run."""
-    if extra(cfg, "enforce_tags") and not cfg.tags:
-        raise ConfigError("tags = [] must name one tag or more; or set extras.enforce_tags=false")
-    if extra(cfg, "view"):
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
-            raise ConfigError("extras.view = true needs one run; leave it out of a sweep")
-        require_viewer()
-
-
 def require_viewer() -> None:
     """Raise a `ConfigError` unless the packages of the viewer are installed."""
     try:

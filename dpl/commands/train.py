@@ -52,11 +52,19 @@ def main(cfg: DictConfig) -> float | None:
     """Train and evaluate a surrogate; return its smallest validation e_mean [-] to a search."""
     cfg = config.resumed_config(cfg, HydraConfig.get().overrides.task)
     config.check(cfg)
-    cli.check_extras(cfg)
+    is_sweep = HydraConfig.get().mode == RunMode.MULTIRUN
+    if cli.extra(cfg, "enforce_tags") and not cfg.tags:
+        raise config.ConfigError(
+            "tags = [] must name one tag or more; or set extras.enforce_tags=false"
+        )
+    if cli.extra(cfg, "view"):
+        if is_sweep:
+            raise config.ConfigError("extras.view = true needs one run; leave it out of a sweep")
+        cli.require_viewer()
     try:
         return _train(cfg)
     except training.Diverged as error:
-        if HydraConfig.get().mode != RunMode.MULTIRUN:
+        if not is_sweep:
             raise config.ConfigError(str(error)) from error
         print(f"error: {error}", file=sys.stderr)
         return math.inf  # a sweep continues with its next run
@@ -91,7 +99,13 @@ def _train(cfg: DictConfig) -> float | None:
     except (SystemExit, KeyboardInterrupt) as leaving:
         # Lightning turns Ctrl-C and SIGTERM into SystemExit, without the status
         if first and session.begun:
-            words = [_script("train"), _run_key(folder), "ckpt_path=last", *session_overrides()]
+            unsaved = OF_THE_SESSION - {"run", "folder", "ckpt_path"}
+            typed = [
+                shlex.quote(line)
+                for line in HydraConfig.get().overrides.task
+                if re.split(r"[.=]", line.lstrip("+~"))[0] in unsaved
+            ]
+            words = [_script("train"), _run_key(folder), "ckpt_path=last", *typed]
             print(f"to resume: {' '.join(words)}", file=sys.stderr)
         terminated = 128 + signal.SIGTERM
         if trainer.received_sigterm or getattr(leaving, "code", None) == terminated:
@@ -153,13 +167,6 @@ def _evaluate(cfg: DictConfig, scene: "dpl.Scene", trainer: Any, session: Any) -
         policy = viewer.AccessPolicy.bind("127.0.0.1", 0, [])  # any free port
         body = viewer.Body(dpl.Simulator(best))
         serve(body, policy, title=_from_here(folder), folder=folder / "view")
-
-
-def session_overrides() -> list[str]:
-    """Return the overrides, as they are typed, that a resumed run does not read from its folder."""
-    groups = OF_THE_SESSION - {"run", "folder", "ckpt_path"}
-    lines = {line: line.lstrip("+~").partition("=")[0] for line in HydraConfig.get().overrides.task}
-    return [shlex.quote(line) for line, key in lines.items() if key.partition(".")[0] in groups]
 
 
 def _from_here(folder: Path) -> str:

@@ -100,8 +100,10 @@ class DataSet:
     def skipped_work(self) -> list[str]:
         """Return one line for each kind of work that is not needed."""
         wanted, there = sum(self.sizes.values()), self._tried
-        same = " with these boundary values over E and L" if self.scene.has_boundary_values else ""
-        sizes = "size" if self.scene.problem.follower_loads.ranges else "size and Young's modulus"
+        problem, constant = self.scene.problem, self.scene.loads.constant_force
+        fixed = constant is not None or problem.has_one_modulus or problem.moved_supports
+        same = " with these boundary values over E and L" if fixed else ""
+        sizes = "size" if problem.follower_loads.ranges else "size and Young's modulus"
         lines = [
             f"one data set for every {sizes} of this body{same}: "
             f"{self.store.folder}, of scene {self.scene.fingerprint[:12]}"

@@ -137,10 +137,9 @@ def evaluate(
         one = replace(within, tol=tight, max_iter=1, error_tol=LEAST_ERROR)
         one.tangent  # noqa: B018  # built here, so that the first call is not slower
         solvers[ONE_STEP] = Corrected(surrogate.predict, one)
-    newton = _own(scene)
-    paper = Hybrid(surrogate.predict, replace(newton, tol=tight), "paper")
+    paper = Hybrid(surrogate.predict, replace(_own(scene), tol=tight), "paper")
     solvers |= {f"paper's hybrid to {power(tight)}": paper, **simulated}
-    solvers |= {newton_row(tol): replace(newton, tol=tol) for tol in tols}
+    solvers |= {newton_row(tol): replace(_own(scene), tol=tol) for tol in tols}
     with one_thread():
         rows, displacements = measure(solvers, test, scene.problem)
         estimates: dict[str, Callable[[Load, Tensor], float]]

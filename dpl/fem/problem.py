@@ -4,7 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -482,11 +482,8 @@ class Problem:
     @cached_property
     def _body_at(self) -> Callable[..., Any]:
         """The problem with one value of each parameter, kept for the last `MAX_BODIES` ones."""
-
-        def body_at(*values: float) -> Any:
-            return self._with_values(torch.tensor([values], dtype=torch.float64))
-
-        return lru_cache(MAX_BODIES)(body_at)
+        numbers = partial(torch.tensor, dtype=torch.float64)
+        return lru_cache(MAX_BODIES)(lambda *values: self._with_values(numbers([values])))
 
     def _with_values(self, parameters: Tensor) -> Self:
         parameters = parameters.to(self.points.device, torch.float64)

@@ -130,7 +130,12 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> SymmetryGrou
     motions = _motions(points, np.count_nonzero(problem.free.cpu().numpy(), axis=1))
     moved = [Symmetry(*(part.to(fields.device) for part in pair)) for pair in motions]
     found = list(filter(holds, moved)) or SymmetryGroup.identity(problem)
-    return SymmetryGroup(sorted(_closed(found), key=lambda symmetry: symmetry.source.tolist()))
+    Q = torch.stack([symmetry.rotation for symmetry in found]).cpu().numpy()
+    products = (Q[:, None] @ Q).reshape(len(Q), len(Q), -1)
+    known = KDTree(Q.reshape(len(Q), -1)).query(products, distance_upper_bound=1e-4)[0]
+    # a group: the members whose products with all others are in the set
+    closed = [s for s, row in zip(found, known, strict=True) if np.isfinite(row).all()]
+    return SymmetryGroup(sorted(closed, key=lambda symmetry: symmetry.source.tolist()))
 
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
@@ -243,11 +248,3 @@ def _fitted(points: Array, source: NDArray[np.int_]) -> Array:
     U, _, Vt = np.linalg.svd(points.T @ points[source])
     Q = U @ Vt
     return np.where(np.abs(Q - Q.round()) < 1e-12, Q.round() + 0.0, Q)
-
-
-def _closed(found: Sequence[Symmetry]) -> list[Symmetry]:
-    """Return the members whose products with all others are in the set: a group."""
-    Q = torch.stack([symmetry.rotation for symmetry in found]).cpu().numpy()
-    products = (Q[:, None] @ Q).reshape(len(Q), len(Q), -1)
-    known = KDTree(Q.reshape(len(Q), -1)).query(products, distance_upper_bound=1e-4)[0]
-    return [s for s, row in zip(found, known, strict=True) if np.isfinite(row).all()]

@@ -77,14 +77,6 @@ def square(e):
 
 
 @inlined
-def reduce_strain(gap, e):
-    """Subtract a strain gap (6, SIMD_WIDTH) from e; return det C - 1."""
-    for v in range(6):
-        store(e, v, load(e, v) - load(gap, v))
-    return square(e)
-
-
-@inlined
 def extrapolate(D, gap, S):
     """Add the stress D gap / 2 to S."""
     for v in range(6):

@@ -180,7 +180,9 @@ def add_system(
             point.strain(H, finite, e)
             J = 1.0 + finite * change
             if mixed:
-                change = point.reduce_strain(strain_gap[block, q], e)
+                for v in range(6):
+                    store(e, v, load(e, v) - load(strain_gap[block, q], v))
+                change = point.square(e)
             keep_minimum(change, low)
             j = change / (1.0 + sqrt(1.0 + change)) if mixed else change
             point.stress(law, constants, e, j, X, S, D, moduli)

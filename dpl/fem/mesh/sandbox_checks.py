@@ -33,7 +33,10 @@ class Refused(ValueError):
 
 
 def check_file(path: Path) -> None:
-    """Refuse files that declare entities or list a node number twice, before they are read."""
+    """Refuse files that declare entities or list a node number twice, before they are read.
+
+    Of several blocks of nodes, meshio would lose all but the last.
+    """
     suffix = path.suffix.lower()
     if suffix in (".vtu", ".xdmf", ".xmf", ".xml"):
         parser = expat.ParserCreate()
@@ -43,9 +46,18 @@ def check_file(path: Path) -> None:
     if suffix == ".xml":  # rows that it declares and does not list would be undefined numbers
         raise Refused(f"its format is DOLFIN XML, {CONVERT}")
     if suffix in NODE_BLOCKS:
-        _check_node_blocks(*NODE_BLOCKS[suffix], path.read_text(errors="replace"))
+        name, pattern = NODE_BLOCKS[suffix]
+        blocks = re.findall(pattern, path.read_text(errors="replace"), re.M | re.I)
+        if len(blocks) > 1:
+            raise Refused(f"it holds {len(blocks)} blocks {name}; join them in one")
+        for block in blocks:
+            lines = [line.replace(",", " ").split() for line in block.splitlines()]
+            _check_unique([int(row[0]) for row in lines if row])
     if suffix == ".avs":
-        _check_avs(path.read_text(errors="replace"))
+        lines = path.read_text(errors="replace").splitlines()
+        rows = [line.split() for line in lines if line.partition("#")[0].strip()]
+        if rows:
+            _check_unique([int(float(row[0])) for row in rows[1 : 1 + int(rows[0][0])]])
     if suffix == ".msh":
         _check_gmsh(path.read_bytes())
 
@@ -61,23 +73,6 @@ def _check_unique(numbers: Any) -> None:
     if twice:
         listed = f"{len(twice)} node numbers are listed more than once: {', '.join(twice[:5])}"
         raise Refused(f"{listed}; number each node once")
-
-
-def _check_node_blocks(name: str, pattern: str, text: str) -> None:
-    """Refuse Abaqus and PERMAS files of which meshio would lose nodes."""
-    blocks = re.findall(pattern, text, re.M | re.I)
-    if len(blocks) > 1:
-        raise Refused(f"it holds {len(blocks)} blocks {name}; join them in one")
-    for block in blocks:
-        rows = [line.replace(",", " ").split() for line in block.splitlines() if line.strip()]
-        _check_unique([int(row[0]) for row in rows])
-
-
-def _check_avs(text: str) -> None:
-    """Refuse AVS-UCD files that list a node number twice."""
-    rows = [line.split() for line in text.splitlines() if line.partition("#")[0].strip()]
-    if rows:
-        _check_unique([int(float(row[0])) for row in rows[1 : 1 + int(rows[0][0])]])
 
 
 def _check_gmsh(data: bytes) -> None:
