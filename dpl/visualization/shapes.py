@@ -71,6 +71,8 @@ def plot_deformed(
         figure.colorbar(scale, cax=bar, orientation="horizontal").set_label(LABEL, fontsize=8)
         bar.tick_params(labelsize=7)
         bar.minorticks_off()
+        if bar.get_xscale() == "linear":  # else labels overlap
+            bar.locator_params(axis="x", nbins=4)
     for ax, name in zip(axes[:, -1], [REFERENCE, *(name for name, _ in predictions)], strict=True):
         ax.set_xlabel(name or "prediction", labelpad=2)
     for row in axes:
