@@ -187,9 +187,10 @@ class Store:
             )
 
     def missing(self, split: str, count: int, shard: int = 0, shards: int = 1) -> list[int]:
-        """Return which of the first `count` loads of a split writer `shard` has to solve.
+        """Return the numbers of the loads below `count` that one writer has to solve.
 
-        The writers, `shards` in number, take blocks of `SHARD_SIZE` loads in turn.
+        The writers, `shards` in number and this one the number `shard`, take blocks of `SHARD_SIZE`
+        loads of a split in turn.
         """
         tried = self.tried(split)
         return [
