@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from dpl import fem
+from dpl.fem.assembly.follower_loads import NO_LOADS
 from dpl.fem.rom.ecsw import Cubature
 from dpl.fem.rom.pod import orthonormal_fields, pod
 from dpl.fem.rom.sampled_tangent import SampledTangent
@@ -113,6 +114,21 @@ def test_all_cells_of_one_point_give_the_tangent_of_the_body(name, cell, grid, b
     found = SampledTangent(problem, vectors, every_cell(problem)).at(problem, u)
     exact = SampledTangent(problem, vectors, None).at(problem, u)
     assert_close(found, exact, rtol=0, atol=2e-6 * abs(exact).max())
+
+
+def test_follower_loads_add_the_derivative_of_their_forces(grid, bend):
+    """The symmetric part, in which two loads have nodes in common."""
+    loads = [fem.FollowerPressure(fem.Plane(axis, "max"), 0.1 + axis) for axis in (0, 2)]
+    mesh = grid("tetra", 2, 0.3, inside=True)
+    problem = fem.Problem.build(mesh, NH, fixed=LEFT, follower_loads=loads)
+    vectors, u = some_modes(problem, 4), 0.5 * bend(problem.points)[0]
+    dead = replace(problem, follower_loads=NO_LOADS)
+    models = [SampledTangent(body, vectors, every_cell(body)) for body in (problem, dead)]
+    found, elastic = (model.at(model.problem, u) for model in models)
+    white = (vectors @ torch.from_numpy(models[0].scale)).movedim(2, 0)
+    ends = (problem.follower_loads.force(u + sign * 1e-6 * white) for sign in (1, -1))
+    slope = white.flatten(1) @ ((next(ends) - next(ends)) / 2e-6).flatten(1).T
+    assert_close(torch.from_numpy(found - elastic), (slope + slope.T) / 2, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize(("name", "kind"), zip(cycle(SAMPLED), KINDS), ids=str)

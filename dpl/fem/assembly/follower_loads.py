@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import skfem
@@ -113,15 +114,14 @@ class LoadedPart:
         raise NotImplementedError
 
     def places_on(self, pattern: Pattern) -> Tensor:
-        """Return `places`, computed once for the last pattern."""
+        """Return `places`, computed once for each pattern."""
         if pattern not in self._places:
-            self._places.clear()
             self._places[pattern] = torch.from_numpy(self.places(pattern).astype(np.int64))
         return self._places[pattern]
 
     @cached_property
-    def _places(self) -> dict[Pattern, Tensor]:
-        return {}
+    def _places(self) -> WeakKeyDictionary[Pattern, Tensor]:
+        return WeakKeyDictionary()
 
     def describe(self) -> str:
         """Return the part in words."""
@@ -250,6 +250,12 @@ class FollowerLoads:
         for value, term in zip(self.values.unbind(1), terms, strict=True):
             total = total + value.reshape(-1, *(1,) * (term.ndim - 1)) * term
         return total
+
+    def pattern_on(self, pattern: Pattern) -> tuple[Pattern, NDArray[np.int64]]:
+        """Return the part of a pattern that `stiffness` fills, see `Pattern.of_entries`."""
+        places = [part.places_on(pattern) for part in self.parts]
+        used = torch.cat([*places, torch.zeros(0, dtype=torch.int64)]).unique().numpy()
+        return pattern.of_entries(used[used < len(pattern.indices)])
 
     def stiffness(self, displacement: Tensor, pattern: Pattern) -> tuple[Tensor, Tensor | None]:
         """Return the symmetric and the skew part of d force / du on the pattern, (B, nnz) each.

@@ -54,6 +54,20 @@ class Pattern:
         indptr, indices = (part.astype(np.int32) for part in (matrix.indptr, matrix.indices))
         return cls(size, indptr, indices, places, number)
 
+    def of_entries(self, places: Integers) -> "tuple[Pattern, Integers]":
+        """Return the pattern of some entries, and the degrees of freedom that it numbers, (m,).
+
+        The places of cells are not those of the entries.
+        """
+        rows = np.repeat(np.arange(self.size), np.diff(self.indptr))[places]
+        dofs, found = np.unique([rows, self.indices[places]], return_inverse=True)
+        row, column = found.reshape(2, -1)
+        begin = np.searchsorted(row, np.arange(len(dofs) + 1))
+        numbers = np.full(self.size + 1, -1)  # the last one is that of fixed degrees of freedom
+        numbers[dofs] = np.arange(len(dofs))
+        indptr, indices = begin.astype(np.int32), column.astype(np.int32)
+        return Pattern(len(dofs), indptr, indices, self.places[:0], numbers[self.number]), dofs
+
     def positions(self, row: Integers, column: Integers) -> Integers:
         """Return the positions of entries of pairs of degrees of freedom that belong to one cell.
 

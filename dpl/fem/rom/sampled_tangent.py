@@ -5,12 +5,13 @@ from functools import cached_property
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.kernels import call_compiled, constants_of
 from dpl.fem.assembly.numba_laws import Law
-from dpl.fem.linear.interface import full_matrix
+from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
@@ -54,6 +55,8 @@ class SampledTangent:
             self._nodes, self._dV = nodes.numpy(), volume.numpy()
             self._dN: Array = mean[:, None].contiguous().numpy()
             self._basis: Single = basis.float().contiguous().numpy()
+            self._loaded, dofs = problem.follower_loads.pattern_on(problem.pattern)
+            self._loaded_rows = self._white[dofs]
 
     def at(self, problem: Problem, displacement: Tensor, *, whole: bool = False) -> Array:
         """Return the matrix (R, R) at a displacement (N, D) of the body with its parameters.
@@ -62,21 +65,18 @@ class SampledTangent:
         `whole` it sums over all cells instead of the chosen ones.
         """
         if whole or not self._has_cells:
-            return self._projection(problem, problem.linearise(displacement[None]).tangent[0])
+            entries = problem.linearise(displacement[None]).tangent[0]
+            return _projection(problem.pattern, entries, self._white)
         product, rank = self._moduli_change_product(problem, displacement), len(self.scale)
         change = self._basis.reshape(-1, rank).T @ product.reshape(-1, rank)
         if problem.follower_loads:
-            stiffness, _ = problem.follower_loads.stiffness(displacement[None], problem.pattern)
-            change = change + self._projection(problem, stiffness[0])
+            stiffness, _ = problem.follower_loads.stiffness(displacement[None], self._loaded)
+            change = change + _projection(self._loaded, stiffness[0], self._loaded_rows)
         if not self.problem.material.parameter_ranges:
             return np.eye(rank) + change
         terms, matrices = self._terms
         factors = np.append(terms.factors(problem.material)[0].numpy(), 1.0)
         return np.tensordot(factors, matrices, 1) + change
-
-    def _projection(self, problem: Problem, entries: Tensor) -> Array:
-        """Return W^T K W of the entries (nnz,) of a matrix."""
-        return self._white.T @ (full_matrix(problem.pattern, entries.numpy()) @ self._white)
 
     def _moduli_change_product(self, problem: Problem, displacement: Tensor) -> Single:
         """Return w vol (A(H) - A(0)) G, (C, D D, R)."""
@@ -107,3 +107,10 @@ class SampledTangent:
         """Terms of K(0), and W^T K_k W of them and of the springs, (T + 1, R, R)."""
         terms = StiffnessTerms.of(self.problem)
         return terms, reduced_terms(terms, torch.from_numpy(self._white))[..., :-1].numpy()
+
+
+def _projection(pattern: Pattern, entries: Tensor, rows: Array) -> Array:
+    """Return W^T K W, (R, R), of the upper entries (nnz,) of a matrix and the rows W (n, R)."""
+    upper = csr_array((entries.numpy(), pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
+    half = rows.T @ (upper @ rows - upper.diagonal()[:, None] / 2 * rows)
+    return half + half.T
