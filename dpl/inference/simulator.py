@@ -199,12 +199,14 @@ class Simulator:
     def _products(self, place: RangeCheck, request: Request) -> int:
         """Return the products with the tangent in an estimate, which softening needs.
 
-        In a range without softening, compact bodies need none. Predictions of thin ones have none,
-        since many products would take longer than the prediction.
+        In a range without softening, compact bodies need them for a tolerance of the error only.
+        Predictions of thin ones have none, since many products would take longer than the
+        prediction.
         """
         is_compact = self.scene.is_compact
         is_usual = place.inside and not self.scene.is_softened
-        if is_usual and (is_compact or not request.is_more_than_prediction):
+        is_decisive = request.error is not None
+        if is_usual and not (is_decisive if is_compact else request.is_more_than_prediction):
             return 0
         return PRODUCTS if is_compact else MANY_PRODUCTS
 

@@ -16,10 +16,10 @@ from dpl.fem.solvers.solution import Load
 RTOL = 1e-2  # relative residual of iterative solves for an estimate [-]
 PRODUCTS = 3  # largest number of products with the tangent
 MANY_PRODUCTS = 30  # the same on thin bodies, where M is not near the inverse of the tangent
-REST = 0.1  # part of the correction, bounding the rest of it, at which the steps end [-]
+REST = 0.03  # part of the correction, bounding the rest of it, at which the steps end [-]
 NEAR = 0.1  # relative residual below which negative curvature is that of the equilibrium [-]
 DOUBT = 3.0  # factor of the estimate where negative curvature is that of spurious stresses
-LINEAR = 1e-3  # relative correction up to which R is linear along it [-]
+LINEAR = 1e-4  # relative correction up to which R is linear along it [-]
 DIFFERENCE = 1e-5  # change of u, relative to u, by which products are computed [-]
 
 

@@ -27,7 +27,7 @@ from dpl.system.checks import check_range
 from dpl.system.threads import on_threads
 
 FEW = 8  # loads by which stored errors are compared with measured ones
-LARGER = 3.0  # ratio of a measured to a stored error up to which both are plausible
+LARGER = 3.0  # median ratio of measured and stored errors up to which both are plausible
 SMALL = 0.1  # part of held-out samples whose sizes are too small for a fit of their errors
 MAX_SIZE = 100_000  # of rank, cells and stages
 # buffers and axes with the numbers of modes, cells, maps, and modes and cells of Newton's method
@@ -203,7 +203,7 @@ class Unrolled(StoredBuffers):
         fields, sizes = self._fields(load.force, load.parameters)
         pairs = zip(load.unbatch(), fields.split(1), strict=True)
         measured = [estimate_error(scene.linear, *pair, products=0).error for pair in pairs]
-        ratio = float((torch.tensor(measured) / self._stored_errors(sizes)[:, 0]).max())
+        ratio = float((torch.tensor(measured) / self._stored_errors(sizes)[:, 0]).median())
         return 1.0 if ratio <= LARGER else ratio
 
     def _fields(self, force: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
