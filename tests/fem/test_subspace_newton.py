@@ -117,8 +117,10 @@ def test_all_cells_of_one_point_give_the_tangent_of_the_body(name, cell, grid, b
 
 
 def test_follower_loads_add_the_derivative_of_their_forces(grid, bend):
-    """The symmetric part, in which two loads have nodes in common."""
+    """The symmetric part; loads have nodes in common, and fixed nodes have no rows."""
     loads = [fem.FollowerPressure(fem.Plane(axis, "max"), 0.1 + axis) for axis in (0, 2)]
+    lower, oblique = fem.Box([0.0, 0.0, 0.0], [1.0, 1.0, 0.5]), fem.ConstantFibres([1.0, 0.6, 0.3])
+    loads.append(fem.ActiveStress(0.2, region=lower, directions=oblique))
     mesh = grid("tetra", 2, 0.3, inside=True)
     problem = fem.Problem.build(mesh, NH, fixed=LEFT, follower_loads=loads)
     vectors, u = some_modes(problem, 4), 0.5 * bend(problem.points)[0]

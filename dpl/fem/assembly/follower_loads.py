@@ -253,8 +253,7 @@ class FollowerLoads:
 
     def pattern_on(self, pattern: Pattern) -> tuple[Pattern, NDArray[np.int64]]:
         """Return the part of a pattern that `stiffness` fills, see `Pattern.of_entries`."""
-        places = [part.places_on(pattern) for part in self.parts]
-        used = torch.cat([*places, torch.zeros(0, dtype=torch.int64)]).unique().numpy()
+        used = torch.cat([part.places_on(pattern) for part in self.parts]).unique().numpy()
         return pattern.of_entries(used[used < len(pattern.indices)])
 
     def stiffness(self, displacement: Tensor, pattern: Pattern) -> tuple[Tensor, Tensor | None]:

@@ -54,19 +54,19 @@ class Pattern:
         indptr, indices = (part.astype(np.int32) for part in (matrix.indptr, matrix.indices))
         return cls(size, indptr, indices, places, number)
 
-    def of_entries(self, places: Integers) -> "tuple[Pattern, Integers]":
-        """Return the pattern of some entries, and the degrees of freedom that it numbers, (m,).
+    def of_entries(self, entries: Integers) -> "tuple[Pattern, Integers]":
+        """Return the pattern of some entries, ascending, and the degrees of freedom in it, (m,).
 
-        The places of cells are not those of the entries.
+        These degrees of freedom are the free ones of the new pattern.
         """
-        rows = np.repeat(np.arange(self.size), np.diff(self.indptr))[places]
-        dofs, found = np.unique([rows, self.indices[places]], return_inverse=True)
-        row, column = found.reshape(2, -1)
-        begin = np.searchsorted(row, np.arange(len(dofs) + 1))
-        numbers = np.full(self.size + 1, -1)  # the last one is that of fixed degrees of freedom
-        numbers[dofs] = np.arange(len(dofs))
-        indptr, indices = begin.astype(np.int32), column.astype(np.int32)
-        return Pattern(len(dofs), indptr, indices, self.places[:0], numbers[self.number]), dofs
+        rows = np.searchsorted(self.indptr, entries, side="right") - 1
+        dofs, found = np.unique([rows, self.indices[entries]], return_inverse=True)
+        row, column = found.reshape(2, -1).astype(np.int32)
+        indptr = np.searchsorted(row, np.arange(len(dofs) + 1)).astype(np.int32)
+        number, place = np.full(self.size + 1, -1), np.full(len(self.indices) + 1, len(entries))
+        number[dofs], place[entries] = np.arange(len(dofs)), np.arange(len(entries))
+        places = place.astype(np.int32)[self.places]
+        return Pattern(len(dofs), indptr, column, places, number[self.number]), dofs
 
     def positions(self, row: Integers, column: Integers) -> Integers:
         """Return the positions of entries of pairs of degrees of freedom that belong to one cell.

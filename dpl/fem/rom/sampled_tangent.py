@@ -55,6 +55,7 @@ class SampledTangent:
             self._nodes, self._dV = nodes.numpy(), volume.numpy()
             self._dN: Array = mean[:, None].contiguous().numpy()
             self._basis: Single = basis.float().contiguous().numpy()
+        if problem.follower_loads:
             self._loaded, dofs = problem.follower_loads.pattern_on(problem.pattern)
             self._loaded_rows = self._white[dofs]
 

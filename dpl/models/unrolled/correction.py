@@ -10,7 +10,7 @@ RANKS = (60, 160)  # numbers of modes that are tried, and all modes
 CANDIDATES = 600  # cells to choose from
 STATES = 64  # equilibria at which cells are chosen
 TOLERANCES = (3e-2, 3e-3)  # of the reduced forces of these cells, coarse and fine [-]
-WORTH = 0.8  # ratio of mean errors after one step up to which the fine tolerance is worth its time
+WORTH = 0.8  # ratio of mean errors after one step below which the fine tolerance is worth its time
 MAX_STEPS = 6  # also of the simulator
 LOADS = 50  # held-out loads by whose errors the number of modes is chosen
 SUFFICIENT = 2e-3  # largest relative error of these loads for which no more modes are tried [-]
@@ -25,8 +25,8 @@ def fit_errors(sizes: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
     The estimated error is the factor times the product of the powers of the sizes: a regression of
     the logarithms of errors on those of sizes. Exponents are shrunk towards those of the root of
     the last correction over the linear coordinates. The factor is such that an error `DEVIATIONS`
-    standard deviations above the regression is estimated correctly. The deviations are
-    leave-one-out residuals.
+    standard deviations above the regression is estimated exactly. The deviations are leave-one-out
+    residuals.
 
     Source: Allen (1974), Technometrics 16 (leave-one-out residuals of a ridge regression).
 
@@ -56,7 +56,7 @@ def choose_newton(
 
     The fewest modes are taken with which `MAX_STEPS` steps bring every load below `SUFFICIENT`;
     else those with the smallest largest error. More cells are chosen where one step then leaves a
-    mean error of at most `WORTH` times the other, as on bodies under a pressure, whose forces hide
+    mean error below `WORTH` times the other, as on bodies under a pressure, whose forces hide
     those of soft modes. The relative errors (S,) of the held-out loads after `MAX_STEPS` steps are
     returned, too.
 
@@ -90,7 +90,7 @@ def choose_newton(
             break
     assert best is not None
     finer = solver(best[0].vectors.shape[2], fine)
-    if errors(finer, 1).mean() <= WORTH * errors(best[0], 1).mean():
+    if errors(finer, 1).mean() < WORTH * errors(best[0], 1).mean():
         return finer, errors(finer, MAX_STEPS)
     return best
 
