@@ -27,7 +27,7 @@ from dpl.system.checks import check_range
 from dpl.system.threads import on_threads
 
 FEW = 8  # loads by which stored errors are compared with measured ones
-LARGER = 3.0  # median ratio of measured and stored errors up to which both are plausible
+LARGER = 3.0  # smallest ratio of measured and stored errors up to which both are plausible
 SMALL = 0.1  # part of held-out samples whose sizes are too small for a fit of their errors
 MAX_SIZE = 100_000  # of rank, cells and stages
 # buffers and axes with the numbers of modes, cells, maps, and modes and cells of Newton's method
@@ -194,17 +194,18 @@ class Unrolled(StoredBuffers):
 
     @cached_property
     def _doubt(self) -> float:
-        """Factor on stored errors that are far below a measured one of a few random loads.
+        """Factor on stored errors that are far below the measured ones of a few random loads.
 
         They are if a file is damaged. The measured error is the correction of K(0) in the rotated
-        frames of the nodes.
+        frames of the nodes, which can be a hundred times too large on thin bodies, but not for all
+        loads.
         """
         scene, load = self.scene, self.scene.loads.sample((0, SCALE_STREAM), range(FEW))
         fields, sizes = self._fields(load.force, load.parameters)
         pairs = zip(load.unbatch(), fields.split(1), strict=True)
         measured = [estimate_error(scene.linear, *pair, products=0).error for pair in pairs]
-        ratio = float((torch.tensor(measured) / self._stored_errors(sizes)[:, 0]).median())
-        return 1.0 if ratio <= LARGER else ratio
+        ratios = torch.tensor(measured) / self._stored_errors(sizes)[:, 0]
+        return float(ratios.max()) if ratios.min() > LARGER else 1.0
 
     def _fields(self, force: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return displacements and the sizes of their corrections, (B, K + 2), see `Maps`."""
