@@ -3,6 +3,7 @@
 Errors, reactions and times of the network and of Newton's method.
 """
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -286,37 +287,47 @@ def against_amplitude(gripper: Gripper, grasps: Sequence[Grasp]) -> list[Amplitu
     return [Amplitude(factor, *map(median, both)) for factor, both in columns.items()]
 
 
-def moving_hand(
+def moving_hands(
     surrogate: TrainedSurrogate,
     grasps: Sequence[Grasp],
-    budget_ms: float | None,
+    budgets: Sequence[float | None],
     *,
     steps: int,
     frames: int,
-) -> Hand:
-    """Return times and errors of a hand that makes each grasp in equal frames.
+) -> list[Hand]:
+    """Return times and errors of a hand for each budget that makes each grasp in equal frames.
 
     The patch of each grasp is new, so that its first frame prepares it.
     """
     scene = surrogate.scene
-    first: list[tuple[float, float]] = []  # wall and processor times
-    times: list[tuple[float, float]] = []
-    errors: list[float] = []
-    gripper = Gripper(surrogate, steps=steps, warm=True)
-    for grasp in grasps:
-        for k in range(1, frames + 1):
-            part = grasp.scaled(k / frames)
-            motion = part.region, part.translation, part.rotation
+    grippers = [Gripper(surrogate, steps=steps, warm=True) for _ in budgets]
+    first, times = ([list[tuple[float, float]]() for _ in budgets] for _ in range(2))
+    errors = [list[float]() for _ in budgets]
+    for grasp, k in itertools.product(grasps, range(1, frames + 1)):
+        part = grasp.scaled(k / frames)
+        found = []
+        for i, gripper in enumerate(grippers):
             begin = time.perf_counter(), time.thread_time()
-            answer = gripper(*motion, budget_ms=budget_ms)
-            own = 1e3 * (time.perf_counter() - begin[0]), 1e3 * (time.thread_time() - begin[1])
-            (times if k > 1 else first).append(own)
-            if k % CHECKED == 0:
-                patch = gripper.patch([grasp.region], [[True] * 3], torch.zeros(1, 0).double())
-                if (known := references(scene, patch, part)) is not None:
-                    u, exact = answer.displacement / scene.length, known[-1].displacement.numpy()
-                    errors.append(float(np.linalg.norm(u - exact) / np.linalg.norm(exact)))
-    errors = errors or [math.nan]  # no reference solution
+            answer = gripper(part.region, part.translation, part.rotation, budget_ms=budgets[i])
+            wall, processor = time.perf_counter() - begin[0], time.thread_time() - begin[1]
+            (times if k > 1 else first)[i].append((1e3 * wall, 1e3 * processor))
+            found.append(answer.displacement / scene.length)
+        patch = grippers[0].patch([grasp.region], [[True] * 3], torch.zeros(1, 0).double())
+        if k % CHECKED == 0 and (known := references(scene, patch, part)) is not None:
+            exact = known[-1].displacement.numpy()
+            for own, u in zip(errors, found, strict=True):
+                own.append(float(np.linalg.norm(u - exact) / np.linalg.norm(exact)))
+    columns = zip(budgets, first, times, errors, strict=True)
+    return [_hand(*column) for column in columns]
+
+
+def _hand(
+    budget_ms: float | None,
+    first: list[tuple[float, float]],
+    times: list[tuple[float, float]],
+    errors: list[float],
+) -> Hand:
+    """Return the row of a hand from wall and processor times [ms] and relative errors."""
     late = 100 * (np.array(first + times) > LATE * (budget_ms or math.inf)).mean(axis=0)
     (p50, cpu_p50), (p99, cpu_p99) = np.quantile(times, [0.5, 0.99], axis=0).tolist()
     return Hand(
@@ -329,8 +340,8 @@ def moving_hand(
         cpu_p99_ms=cpu_p99,
         late=float(late[0]),
         cpu_late=float(late[1]),
-        rel_L2_median=median(errors),
-        rel_L2_worst=max(errors),
+        rel_L2_median=median(errors) if errors else math.nan,  # no reference solution
+        rel_L2_worst=max(errors, default=math.nan),
     )
 
 
@@ -380,10 +391,7 @@ def main(cfg: DictConfig) -> None:
         rows, unknown = measure(gripper, every, say)
         amplitudes = against_amplitude(gripper, every[: cfg.amplitudes])
         some = every[: cfg.hands]
-        hands = [
-            moving_hand(surrogate, some, budget, steps=MAX_STEPS, frames=cfg.frames)
-            for budget in BUDGETS
-        ]
+        hands = moving_hands(surrogate, some, BUDGETS, steps=MAX_STEPS, frames=cfg.frames)
     record(hands, stem.with_name(f"{cfg.name}_hand"), f"{cfg.hands} grasps as motions of a hand")
     record(rows, stem, f"{cfg.count - unknown} random grasps, 1 thread")
     record(amplitudes, stem.with_name(f"{cfg.name}_amplitude"), None, draw)

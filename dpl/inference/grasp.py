@@ -209,8 +209,8 @@ class Gripper:
         """Prepare a patch as far as the budget allows; return True if the call can go on."""
         if patch.is_prepared:
             return True
-        for _ in self._durations.each("preparation", patch.preparation):
-            if request.over("preparation"):
+        for _ in patch.preparation:
+            if request.over():
                 return False
         return not request.over("start")
 
@@ -261,7 +261,7 @@ class Gripper:
             if k < parts:
                 body = self._held(end.patch, start.motion + (k / parts) * change, load, request)
             found = body.corrected(end.patch.moved(field, body.goal), self.steps, request)
-            if found is None or (k < parts and request.over("step", "errors")):
+            if found is None or (k < parts and request.over("step")):
                 return None
             field, count = found.state.displacement[0], count + int(found.state.iterations)
             best = found._replace(state=found.state._replace(iterations=torch.tensor([count])))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -167,7 +168,9 @@ class HeldBody:
         valid: list[Solution] = []
         error = math.inf
         iterates = AndersonSolver(self.newton, max_iter=steps).iterate(self.load, guess=guess[None])
-        for state in request.durations.each("step", iterates):
+        with request.durations.timed("guess"):  # takes less than a step
+            first = next(iterates)
+        for state in chain([first], request.durations.each("step", iterates)):
             if not bool(state.volume_ratio > 0):
                 break
             valid.append(state)
@@ -178,7 +181,7 @@ class HeldBody:
                 error = change * (max(ratio, least) if ratio < CONTRACTION else 1.0)
                 if ratio < CONTRACTION and error < enough:
                     break
-            if len(valid) <= steps and request.over("step", "errors"):
+            if len(valid) <= steps and request.over("step"):
                 break
         best = min(valid, key=lambda one: float(one.residual), default=None)
         return None if best is None else Candidate("corrected", best, error)

@@ -171,12 +171,13 @@ class Request:
     def over(self, *stages: str) -> bool:
         """Return True if the next stages and the end of the call exceed the budget.
 
-        The caller then ends. The forecast of the first of them decreases.
+        The caller then ends. The forecast of the first of them decreases. Without stages the next
+        one takes too little to be forecast.
         """
         if self.budget_ms is None:
             return False
         is_over = sum(map(self.durations.forecast, (*stages, FINISH))) > self.seconds_left
-        if is_over:
+        if is_over and stages:
             self.durations.add(stages[0], DECAY * self.durations.forecast(stages[0]))
         self.spent |= is_over
         return is_over

@@ -21,6 +21,7 @@ from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.newton import Newton
 
 RTOL = 1e-6  # relative residual of the linear solutions that give the compliance [-]
+RIGID = 0.1  # part of a displacement of the patch that is no rigid motion and is neglected [-]
 FACING = 0.966  # smallest cosine, of 15 degrees, between a facet's normal and the axis it faces [-]
 
 
@@ -273,14 +274,28 @@ class RigidPatch:
     def moved(self, displacement: Tensor, goal: Tensor) -> Tensor:
         """Return a displacement (N, D) whose patch is at a goal (m,), from one near it [-].
 
-        The difference is a linear displacement in the rotated frames of the nodes.
+        The difference is a linear displacement in the rotated frames of the nodes. It is a sum of
+        `rigid_fields` if the parts move by rigid motions, up to `RIGID` of the distance: a support
+        that jumps by the rest is at the goal, and the next correction removes its stresses.
         """
         problem, frames = self.problem, self.linear.corotational.at(displacement[None])
         missing = problem.restrict(self.at(goal - self.of_field(displacement)))
         gap = torch.from_numpy(frames.local(missing)[self.places])
+        motions = self._motions_of @ gap
+        rest = gap - self.rigid_motions @ motions
+        if float(rest.abs().max()) <= RIGID * float(gap.abs().max()):
+            moved = displacement + problem.extend(
+                frames.turned(motions.numpy() @ self.rigid_fields)
+            )
+            return moved + self.at(goal - self.of_field(moved))
         force = problem.restrict(self.at(self.stiffness_times(gap)))
         added = frames.turned(self.linear.float32_factor.solve(force))
         return displacement + problem.extend(added)
+
+    @cached_property
+    def _motions_of(self) -> Tensor:
+        """Least-squares motions by displacements of the patch, (P R, m)."""
+        return torch.linalg.pinv(self.rigid_motions)
 
     def wrench(self, force: Tensor, displacement: Tensor) -> Wrench:
         """Return the resultants of forces (N, D) [-] on the parts at a displacement (N, D) [-]."""
