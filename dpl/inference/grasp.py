@@ -358,8 +358,7 @@ class Gripper:
         unit, dim = float(load.young) * scene.force_unit, scene.problem.shape[1]
         assert held.force is not None
         patch, nodal = body.patch, body.patch.at(held.force)
-        errors = body.wrench_errors(held)
-        parts = [*patch.wrench(nodal, state.displacement[0]), *errors]
+        parts = *patch.wrench(nodal, state.displacement[0]), *body.wrench_errors(held)
         force, moment, *errors = (part[0] if is_one else part for part in parts)
         count = 6 if dim == 3 else 3
         arms = torch.where(torch.arange(count * len(patch.parts)) % count < dim, 1.0, scene.length)
