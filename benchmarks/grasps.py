@@ -3,6 +3,7 @@
 Errors, reactions and times of the network and of Newton's method.
 """
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -101,10 +102,13 @@ class Hand:
 
     budget_ms: float | None  # wall time of a frame [ms]; None: no budget
     frames: int  # number of frames
-    first_ms: float  # time of the first frame, which prepares the patch [ms]
+    first_ms: float  # time of the first frame of a patch, which prepares it [ms]
     p50_ms: float  # times of the others [ms]
     p99_ms: float
+    cpu_p50_ms: float  # processor times of the others, without those of other programs [ms]
+    cpu_p99_ms: float
     late: float  # part of the frames that take more than `LATE` times the budget [%]
+    cpu_late: float  # part of the frames whose processor time is that long [%]
     # rel_L2_median, rel_L2_worst: relative L2 errors of every `CHECKED`th displacement [-]
     rel_L2_median: float
     rel_L2_worst: float
@@ -197,11 +201,11 @@ def measure(
     found: dict[str, list[list[float]]] = {name: [] for name in (*options, NEWTON)}
     unit = float(scene.loads.moduli[0]) * scene.force_unit
     for k, grasp in enumerate(grasps):
-        patch = gripper.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
+        patch = gripper.patch([grasp.region], [[True] * 3], torch.zeros(1, 0).double())
         if (known := references(scene, patch, grasp)) is None:
             continue
         for one in (gripper, raw):  # times are those of a patch that is prepared
-            one.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double()).compliance_factor  # noqa: B018
+            one.patch([grasp.region], [[True] * 3], torch.zeros(1, 0).double()).compliance_factor  # noqa: B018
         rest, exact = known
         size = grasp.region.radius / scene.length
         own = _errors(patch, size, (rest.displacement, rest.force), exact)
@@ -269,7 +273,7 @@ def against_amplitude(gripper: Gripper, grasps: Sequence[Grasp]) -> list[Amplitu
         size = 0.0
         for factor in factors:
             part = grasp.scaled(factor)
-            patch = raw.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
+            patch = raw.patch([grasp.region], [[True] * 3], torch.zeros(1, 0).double())
             if (known := references(scene, patch, part)) is None:
                 break
             exact = known[-1].displacement
@@ -283,41 +287,61 @@ def against_amplitude(gripper: Gripper, grasps: Sequence[Grasp]) -> list[Amplitu
     return [Amplitude(factor, *map(median, both)) for factor, both in columns.items()]
 
 
-def moving_hand(
+def moving_hands(
     surrogate: TrainedSurrogate,
     grasps: Sequence[Grasp],
-    budget_ms: float | None,
+    budgets: Sequence[float | None],
     *,
     steps: int,
     frames: int,
-) -> Hand:
-    """Return times and errors of a hand that makes each grasp in equal frames.
+) -> list[Hand]:
+    """Return times and errors of a hand for each budget that makes each grasp in equal frames.
 
-    Each grasp has a new gripper, so that its first frame prepares the patch.
+    The patch of each grasp is new, so that its first frame prepares it.
     """
     scene = surrogate.scene
-    first: list[float] = []
-    times: list[float] = []
-    errors: list[float] = []
-    for grasp in grasps:
-        gripper = Gripper(surrogate, steps=steps, warm=True)
-        for k in range(1, frames + 1):
-            part = grasp.scaled(k / frames)
-            motion = part.region, part.translation, part.rotation
-            begin = time.perf_counter()
-            answer = gripper(*motion, budget_ms=budget_ms)
-            (times if k > 1 else first).append(1e3 * (time.perf_counter() - begin))
-            if k % CHECKED == 0:
-                patch = gripper.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
-                if (known := references(scene, patch, part)) is not None:
-                    u, exact = answer.displacement / scene.length, known[-1].displacement.numpy()
-                    errors.append(float(np.linalg.norm(u - exact) / np.linalg.norm(exact)))
-    errors = errors or [math.nan]  # no reference solution
-    late = np.array([*first, *times]) > LATE * (budget_ms or math.inf)
-    p50, p99 = np.quantile(times, [0.5, 0.99]).tolist()
-    count, worst = len(first) + len(times), max(errors)
+    grippers = [Gripper(surrogate, steps=steps, warm=True) for _ in budgets]
+    first, times = ([list[tuple[float, float]]() for _ in budgets] for _ in range(2))
+    errors = [list[float]() for _ in budgets]
+    for grasp, k in itertools.product(grasps, range(1, frames + 1)):
+        part = grasp.scaled(k / frames)
+        found = []
+        for i, gripper in enumerate(grippers):
+            begin = time.perf_counter(), time.thread_time()
+            answer = gripper(part.region, part.translation, part.rotation, budget_ms=budgets[i])
+            wall, processor = time.perf_counter() - begin[0], time.thread_time() - begin[1]
+            (times if k > 1 else first)[i].append((1e3 * wall, 1e3 * processor))
+            found.append(answer.displacement / scene.length)
+        patch = grippers[0].patch([grasp.region], [[True] * 3], torch.zeros(1, 0).double())
+        if k % CHECKED == 0 and (known := references(scene, patch, part)) is not None:
+            exact = known[-1].displacement.numpy()
+            for own, u in zip(errors, found, strict=True):
+                own.append(float(np.linalg.norm(u - exact) / np.linalg.norm(exact)))
+    columns = zip(budgets, first, times, errors, strict=True)
+    return [_hand(*column) for column in columns]
+
+
+def _hand(
+    budget_ms: float | None,
+    first: list[tuple[float, float]],
+    times: list[tuple[float, float]],
+    errors: list[float],
+) -> Hand:
+    """Return the row of a hand from wall and processor times [ms] and relative errors."""
+    late = 100 * (np.array(first + times) > LATE * (budget_ms or math.inf)).mean(axis=0)
+    (p50, cpu_p50), (p99, cpu_p99) = np.quantile(times, [0.5, 0.99], axis=0).tolist()
     return Hand(
-        budget_ms, count, median(first), p50, p99, 100 * float(late.mean()), median(errors), worst
+        budget_ms=budget_ms,
+        frames=len(first) + len(times),
+        first_ms=median(wall for wall, _ in first),
+        p50_ms=p50,
+        p99_ms=p99,
+        cpu_p50_ms=cpu_p50,
+        cpu_p99_ms=cpu_p99,
+        late=float(late[0]),
+        cpu_late=float(late[1]),
+        rel_L2_median=median(errors) if errors else math.nan,  # no reference solution
+        rel_L2_worst=max(errors, default=math.nan),
     )
 
 
@@ -367,10 +391,7 @@ def main(cfg: DictConfig) -> None:
         rows, unknown = measure(gripper, every, say)
         amplitudes = against_amplitude(gripper, every[: cfg.amplitudes])
         some = every[: cfg.hands]
-        hands = [
-            moving_hand(surrogate, some, budget, steps=MAX_STEPS, frames=cfg.frames)
-            for budget in BUDGETS
-        ]
+        hands = moving_hands(surrogate, some, BUDGETS, steps=MAX_STEPS, frames=cfg.frames)
     record(hands, stem.with_name(f"{cfg.name}_hand"), f"{cfg.hands} grasps as motions of a hand")
     record(rows, stem, f"{cfg.count - unknown} random grasps, 1 thread")
     record(amplitudes, stem.with_name(f"{cfg.name}_amplitude"), None, draw)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dpl.fem import Load, RigidPatch, evaluate_solution
+from dpl.fem.solvers.rigid_patch import rotations
 from dpl.inference.answer import UNRELIABLE, Answer, RangeCheck, answer_of, relative
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.held_body import MAX_ITER, MOTION_TOL, HeldBody
@@ -50,13 +50,17 @@ class GraspAnswer(Answer):
     - `iterations` counts predictions, corrections and linear solves of Newton's method.
 
     Attributes:
-        force: Resultant of the forces of the gripper on the body, (D,) [N] (2D: [N/m]).
+        force: Resultant of the forces of the gripper on the body, (D,) [N] (2D: [N/m]). Of several
+            patches, this and the following have a first axis P.
         moment: Their moment about the centre of the displaced patch, (3,) [N m], in 2D (1,) [N].
         nodal_force: The forces of the gripper, (N, D) [N]; zero outside of the patch.
         motion_error: Largest distance of a held node from its prescribed place [m].
         force_error, moment_error: Estimated errors of `force` and `moment` over their norms [-],
             see `HeldBody.wrench_errors`: no bounds. They can be far larger than `error`. They are
             infinite if `error` is, and large where symmetry makes a resultant zero.
+        stiffness: Forces and moments of the patches by their translations and rotations about their
+            centres, (P R, P R), R = 6, in 2D 3 [N/m, N, N m]: that of the linear body, turned with
+            each patch, symmetric, and exact at rest.
         forces_found: True if the network predicts the motion under forces that were found, or if
             the state of the last call was continued. False: the linear displacement closes the gap
             of the nearest prediction, or the motion was made in parts.
@@ -68,8 +72,9 @@ class GraspAnswer(Answer):
     moment: Any
     nodal_force: Any
     motion_error: float
-    force_error: float
-    moment_error: float
+    force_error: Any
+    moment_error: Any
+    stiffness: Any
     forces_found: bool
     stopped: bool
 
@@ -78,7 +83,7 @@ class Grip(NamedTuple):
     """A state of a grasped body, from which the next motion of its patch starts."""
 
     patch: RigidPatch
-    motion: Tensor  # translation over L [-] and rotation vector [rad]
+    motion: Tensor  # translations over L [-] and rotation vectors [rad], (P, R)
     force: Tensor  # of the gripper at held degrees of freedom, (m,) [-]
     field: Tensor  # displacement, (N, D) [-]
 
@@ -116,8 +121,8 @@ class Gripper:
     def __call__(
         self,
         region: Any,
-        translation: Sequence[float | None],
-        rotation: ArrayLike | None = None,
+        translation: Sequence[Any],
+        rotation: Any = None,
         *,
         force: ArrayLike | Tensor | None = None,
         young: float | None = None,
@@ -133,6 +138,8 @@ class Gripper:
         equilibrium, are made in parts from rest, each of which is corrected. With a tolerance,
         Newton's method solves the equilibrium of the body with the patch as a moved support, from
         this state.
+
+        Lists of P regions, translations and rotations grasp several patches at the same time.
 
         Args:
             region: The patch: a region of `dpl.fem` in the coordinates of the mesh, or a mask of
@@ -152,27 +159,38 @@ class Gripper:
 
         Raises:
             ValueError: An argument has a wrong shape or is out of range, the patch has no node that
-                is free to move, or a patch that slides faces no axis.
+                is free to move, a patch that slides faces no axis, or two patches have a node in
+                common.
         """
         request = Request(tol, budget_ms, None, self._durations, self.warm)
         load = self._load(force, young, parameters)
-        motion, directions = self._motion(translation, rotation)
-        patch = self.patch(region, directions, load.parameters)
+        is_one = not isinstance(region, (list, tuple))
+        regions, translations, turns = region, translation, rotation
+        if is_one:
+            regions, translations, turns = [region], [translation], [rotation]
+        turns = [None] * len(regions) if turns is None else turns
+        if not 0 < len(regions) == len(translations) == len(turns):
+            counts = len(regions), len(translations), len(turns)
+            raise ValueError(f"region, translation, rotation: their lengths {counts} must be equal")
+        motions, directions = zip(*map(self._motion, translations, turns), strict=True)
+        motion = torch.stack(motions)
+        patch = self.patch(regions, directions, load.parameters)
         last = self._last.pop() if self._last else None
         with one_thread(), torch.inference_mode():
             body = self._held(patch, motion, load, request)
             if not self._is_prepared(patch, request):
                 with self._durations.timed(FINISH):
-                    return self._reported(body, load, body.at_rest(), request)
+                    return self._reported(body, load, body.at_rest(), request, is_one=is_one)
             if last is not None and not (self.warm and last.patch is patch):
                 last = None
             best: Candidate | None = None
+            stage = "start" if last is None else "state"  # which takes less
             states = self._states(body, motion, load, last, request)
-            for candidate in self._durations.each("state", states):
+            for candidate in self._durations.each(stage, states):
                 candidate = body.with_errors(candidate, request)
                 if best is None or candidate.known_error < best.known_error:
                     best = candidate
-                if best.known_error <= ACCURATE or request.over("state", "errors"):
+                if best.known_error <= ACCURATE or request.over("start", "errors"):
                     break
             assert best is not None
             reached = best  # also with a tolerance, so that a hand does not depend on comparisons
@@ -185,25 +203,25 @@ class Gripper:
                     self._last.append(
                         Grip(patch, motion, reached.force, reached.state.displacement[0])
                     )
-                return self._reported(body, load, best, request)
+                return self._reported(body, load, best, request, is_one=is_one)
 
     def _is_prepared(self, patch: RigidPatch, request: Request) -> bool:
         """Prepare a patch as far as the budget allows; return True if the call can go on."""
-        while missing := patch.missing_rows:
-            one = missing * (self._durations.forecast("row") or math.inf) > request.seconds_left
-            with self._durations.timed("row") if one else nullcontext():
-                patch.prepare(one=one)
-            if request.over("row" if patch.missing_rows else "state"):
+        if patch.is_prepared:
+            return True
+        for _ in patch.preparation:
+            if request.over():
                 return False
-        return True
+        return not request.over("start")
 
     def _held(self, patch: RigidPatch, motion: Tensor, load: Load, request: Request) -> HeldBody:
         """Return the body with a patch at a motion; its law has the parameters of the load."""
         dim = patch.held.shape[1]
-        goal = patch.displacement(motion[:dim].tolist(), motion[dim:].tolist())
+        goal = patch.displacement(motion[:, :dim], motion[:, dim:])
+        turns = torch.from_numpy(rotations(motion[:, dim:], dim).as_matrix()[:, :dim, :dim])
         newton = patch.newton(self.scene.corrector, goal)
         newton = newton if request.tol is None else replace(newton, tol=request.tol)
-        return HeldBody(patch, goal, Load(load.force, load.young), newton)
+        return HeldBody(patch, goal, turns, Load(load.force, load.young), newton)
 
     def _states(
         self, body: HeldBody, motion: Tensor, load: Load, last: Grip | None, request: Request
@@ -230,7 +248,7 @@ class Gripper:
 
     def _parts(self, motion: Tensor) -> int:
         """Return the number of parts with rotations of at most `MAX_TURN`, if they are not many."""
-        turn = float(motion[self.scene.problem.shape[1] :].norm())
+        turn = float(motion[:, self.scene.problem.shape[1] :].norm(dim=1).max())
         return min(max(math.ceil(turn / MAX_TURN), 1), MAX_PARTS)
 
     def _in_parts(
@@ -243,7 +261,7 @@ class Gripper:
             if k < parts:
                 body = self._held(end.patch, start.motion + (k / parts) * change, load, request)
             found = body.corrected(end.patch.moved(field, body.goal), self.steps, request)
-            if found is None or (k < parts and request.over("step", "errors")):
+            if found is None or (k < parts and request.over("step")):
                 return None
             field, count = found.state.displacement[0], count + int(found.state.iterations)
             best = found._replace(state=found.state._replace(iterations=torch.tensor([count])))
@@ -315,46 +333,57 @@ class Gripper:
         motion = motion.where(motion.abs() >= LEAST_MOTION, 0.0)
         return motion, [x is not None for x in moves]
 
-    def patch(self, region: Any, directions: Sequence[bool], parameters: Tensor) -> RigidPatch:
-        """Return a patch, one of the last `MAX_PATCHES` or a new one; see `RigidPatch.of`.
+    def patch(
+        self, regions: Sequence[Any], directions: Sequence[Sequence[bool]], parameters: Tensor
+    ) -> RigidPatch:
+        """Return the union of patches, one of the last `MAX_PATCHES` or a new one.
 
-        `parameters` are those of the law, (1, P).
+        See `RigidPatch.of` for regions and directions. `parameters` are those of the law, (1, P).
         """
         linear = self.scene.linear.with_parameters(parameters)
-        patch = RigidPatch.of(linear, region, directions, sliding=self.sliding)
-        key = patch.held.numpy().tobytes() + parameters.numpy().tobytes()
+        own = zip(regions, directions, strict=True)
+        each = [RigidPatch.of(linear, *one, sliding=self.sliding) for one in own]
+        patch = RigidPatch.union(each)
+        key = b"".join(one.held.numpy().tobytes() for one in each) + parameters.numpy().tobytes()
         patch = self._patches[key] = self._patches.pop(key, patch)  # the most recent is the last
         if len(self._patches) > MAX_PATCHES:
             del self._patches[next(iter(self._patches))]
         return patch
 
     def _reported(
-        self, body: HeldBody, load: Load, held: Candidate, request: Request
+        self, body: HeldBody, load: Load, held: Candidate, request: Request, *, is_one: bool
     ) -> GraspAnswer:
         """Return a candidate as an answer in SI units."""
         scene, state = self.scene, held.state
-        unit = float(load.young) * scene.force_unit
+        unit, dim = float(load.young) * scene.force_unit, scene.problem.shape[1]
         assert held.force is not None
-        nodal = body.patch.at(held.force)
-        wrench = body.patch.wrench(nodal, state.displacement[0])
-        force_error, moment_error = body.wrench_errors(held)
+        patch, nodal = body.patch, body.patch.at(held.force)
+        parts = *patch.wrench(nodal, state.displacement[0]), *body.wrench_errors(held)
+        force, moment, *errors = (part[0] if is_one else part for part in parts)
+        count = 6 if dim == 3 else 3
+        arms = torch.where(torch.arange(count * len(patch.parts)) % count < dim, 1.0, scene.length)
+        stiffness = math.nan * arms.outer(arms)  # while the patch is not prepared
+        if held.method != "rest":
+            stiffness = unit / scene.length * arms.outer(arms) * patch.stiffness(body.turns)
         (place,) = RangeCheck.of(self.surrogate, load._replace(force=load.force + nodal))
         place = place._replace(outside=place.outside and not held.known_error < UNRELIABLE)
         fields = vars(answer_of(held, place, request, scene))
         missed = held.motion_error * scene.length
         words = f"motion error {missed:.1e} m; {fields['summary']}"
-        words += f"; force within about {relative(force_error)}, moment {relative(moment_error)}"
+        within = [relative(float(error.max())) for error in errors]
+        words += f"; force within about {within[0]}, moment {within[1]}"
         if request.spent:
             words += f"; stopped by the budget of {request.budget_ms:g} ms"
         numpy = {"displacement": fields["displacement"].numpy(), "summary": words}
         return GraspAnswer(
             **(fields | numpy),
-            force=unit * wrench.force.numpy(),
-            moment=unit * scene.length * wrench.moment.numpy(),
+            force=unit * force.numpy(),
+            moment=unit * scene.length * moment.numpy(),
             nodal_force=unit * nodal.numpy(),
             motion_error=missed,
-            force_error=force_error,
-            moment_error=moment_error,
+            force_error=errors[0].numpy()[()],
+            moment_error=errors[1].numpy()[()],
+            stiffness=stiffness.numpy(),
             forces_found=held.forces_found,
             stopped=request.spent,
         )

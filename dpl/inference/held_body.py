@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ MAX_ITER = 16  # predictions for a motion
 MEMORY = 8  # iterations from which Anderson's method extrapolates
 CORRECTED = 3e-5  # relative error of a displacement below which its correction ends [-]
 CORRECTED_WARM = 1e-4  # the same of the frames of a moving hand [-]
+LEAST_RATE = 0.2  # smallest contraction of errors that the estimates of a moving hand assume [-]
 CONTRACTION = 0.5  # ratio of residuals below which a correction contracts [-]
 
 
@@ -34,6 +36,7 @@ class HeldBody:
 
     patch: RigidPatch
     goal: Tensor  # displacement of the patch, (m,) [-]
+    turns: Tensor  # rotations of its parts there, (P, D, D)
     load: Load  # other forces on the body, B = 1, without parameters of the law
     newton: Newton  # with the patch as a moved support
 
@@ -102,14 +105,17 @@ class HeldBody:
         """Return a candidate with the forces of the gripper and its errors, estimated if in time.
 
         A correction that has contracted shows that the preconditioner is near the inverse of the
-        tangent. The estimate then needs no products with the tangent.
+        tangent. The estimate then needs no products with the tangent. A moving hand has the error
+        of its last correction, see `corrected`.
         """
         patch, state, u = self.patch, candidate.state, candidate.state.displacement
         evaluation, force = self.newton.problem.evaluate(u), candidate.force
         if force is None:
             force = patch.of_field(evaluation.internal[0] - self.load.force[0])
         missed = float(patch.at(self.goal - patch.of_field(u[0])).norm(dim=1).max())
-        candidate = candidate._replace(force=force, motion_error=missed)
+        candidate = candidate._replace(force=force, motion_error=missed, evaluation=evaluation)
+        if request.warm and candidate.known_error < CORRECTED_WARM:
+            return candidate
         if request.over("errors"):
             return candidate
         products = 0 if candidate.known_error < CORRECTED_WARM else PRODUCTS
@@ -121,42 +127,50 @@ class HeldBody:
         return candidate._replace(
             state=state.unstable() if found.is_indefinite else state,
             error=found.error + missed / largest,
-            correction=found.correction,
         )
 
-    def wrench_errors(self, candidate: Candidate) -> tuple[float, float]:
-        """Return the estimated relative errors of force and moment of the gripper [-].
+    def wrench_errors(self, candidate: Candidate) -> tuple[Tensor, Tensor]:
+        """Return the estimated relative errors of forces and moments of the parts, (P,) each [-].
 
-        The estimates compare them with those of the corrected displacement: the correction behind
-        the estimated error of the displacement is added, and the linear forces that move the patch
-        to its goal. They cost one residual.
+        The estimates compare them with the forces that balance the stresses, plus the work of the
+        residual by unit motions of the parts, plus the linear forces that move the patch to its
+        goal. The work is the reaction of the correction that the residual causes (Betti).
         """
-        if candidate.correction is None:
-            return math.inf, math.inf
-        patch, u = self.patch, candidate.state.displacement
-        better = u + candidate.correction
-        reaction = self.newton.problem.evaluate(better).internal - self.load.force
-        moved = patch.stiffness_times(self.goal - patch.of_field(u[0]))
-        expected = patch.wrench(patch.at(patch.of_field(reaction[0]) + moved), better[0])
+        patch, u = self.patch, candidate.state.displacement[0]
         assert candidate.force is not None
-        found = patch.wrench(patch.at(candidate.force), u[0])
-        pairs = zip(found, expected, strict=True)
-        sizes = [(float((a - b).norm()), float(a.norm())) for a, b in pairs]
-        force, moment = (e / max(size, 1e-300) if e >= 0 else math.inf for e, size in sizes)
-        return force, moment
+        if not candidate.known_error < math.inf:
+            unknown = torch.full((len(patch.parts),), math.inf, dtype=torch.float64)
+            return unknown, unknown
+        evaluation = candidate.evaluation or self.newton.problem.evaluate(u[None])
+        balance = evaluation.internal[0] - self.load.force[0]
+        reaction = patch.of_field(balance)
+        if candidate.motion_error:
+            reaction = reaction + patch.stiffness_times(self.goal - patch.of_field(u))
+        rest = self.newton.problem.acting(balance)
+        change = patch.work(rest, u, self.turns)
+        found, balanced = (patch.wrench(patch.at(f), u) for f in (candidate.force, reaction))
+        errors = []
+        for own, expected, added in zip(found, balanced, change, strict=True):
+            size = own.norm(dim=1).clamp(min=1e-300)
+            error = (expected + added - own).norm(dim=1) / size
+            errors.append(error.nan_to_num(math.inf, math.inf))
+        return errors[0], errors[1]
 
     def corrected(self, guess: Tensor, steps: int, request: Request) -> Candidate | None:
         """Return the iterate of least residual from a guess (N, D); None if that is inverted.
 
         Iterations with the corotated factor of K(0) end with the budget, or when the error is below
         `CORRECTED`, with `warm` `CORRECTED_WARM`: the last change times the ratio of the residuals
-        after and before it, if this ratio is below `CONTRACTION`.
+        after and before it, if this ratio is below `CONTRACTION`. Soft errors contract more slowly
+        than residuals, so that `warm` states, whose error this is, assume at least `LEAST_RATE`.
         """
-        enough = CORRECTED_WARM if request.warm else CORRECTED
+        enough, least = (CORRECTED_WARM, LEAST_RATE) if request.warm else (CORRECTED, 0.0)
         valid: list[Solution] = []
         error = math.inf
         iterates = AndersonSolver(self.newton, max_iter=steps).iterate(self.load, guess=guess[None])
-        for state in request.durations.each("step", iterates):
+        with request.durations.timed("guess"):  # takes less than a step
+            first = next(iterates)
+        for state in chain([first], request.durations.each("step", iterates)):
             if not bool(state.volume_ratio > 0):
                 break
             valid.append(state)
@@ -164,10 +178,10 @@ class HeldBody:
                 before, u = valid[-2], state.displacement
                 ratio = float(state.residual / before.residual)
                 change = float((u - before.displacement).norm() / u.norm())
-                error = change * (ratio if ratio < CONTRACTION else 1.0)
+                error = change * (max(ratio, least) if ratio < CONTRACTION else 1.0)
                 if ratio < CONTRACTION and error < enough:
                     break
-            if len(valid) <= steps and request.over("step", "errors"):
+            if len(valid) <= steps and request.over("step"):
                 break
         best = min(valid, key=lambda one: float(one.residual), default=None)
         return None if best is None else Candidate("corrected", best, error)

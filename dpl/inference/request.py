@@ -171,12 +171,14 @@ class Request:
     def over(self, *stages: str) -> bool:
         """Return True if the next stages and the end of the call exceed the budget.
 
-        The caller then ends. The forecast of the first of them decreases.
+        The caller then ends. The forecast of the first of them, if there is one, decreases. Without
+        stages the next one takes too little to be forecast.
         """
         if self.budget_ms is None:
             return False
-        is_over = sum(map(self.durations.forecast, (*stages, FINISH))) > self.seconds_left
-        if is_over:
-            self.durations.add(stages[0], DECAY * self.durations.forecast(stages[0]))
+        forecasts = list(map(self.durations.forecast, (*stages, FINISH)))
+        is_over = sum(forecasts) > self.seconds_left
+        if is_over and stages and forecasts[0]:  # zeros would displace times
+            self.durations.add(stages[0], DECAY * forecasts[0])
         self.spent |= is_over
         return is_over

@@ -63,7 +63,7 @@ def test_the_error_of_a_linear_network_has_slope_two(gripper, some):
 
 
 def test_a_hand_that_moves_is_accurate_in_each_frame(gripper, some):
-    hand = grasps.moving_hand(gripper.surrogate, some[:2], None, steps=6, frames=20)
+    (hand,) = grasps.moving_hands(gripper.surrogate, some[:2], [None], steps=6, frames=20)
     assert (hand.frames, hand.late) == (40, 0)
     assert hand.rel_L2_worst < 1e-2
     assert hand.rel_L2_median < 1e-3

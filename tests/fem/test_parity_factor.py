@@ -44,6 +44,19 @@ def test_the_factor_by_parity_solves_like_the_whole_with_one_unknown_for_each_or
     assert len(factor.orbits.weight) < 0.75 * solver.problem.pattern.size
 
 
+def test_entries_of_the_inverse_are_those_of_solutions(body):
+    """In short steps: of the forward pass of the parities, of blocks of solutions elsewhere."""
+    solver, _ = body
+    size = solver.problem.pattern.size
+    places = np.random.default_rng(0).choice(size, 40, replace=False)
+    exact = solver.factor.solve_many(np.eye(size)[places])[:, places]
+    for factor in (solver.float32_factor, solver.factor):
+        found = np.zeros((40, 40))
+        steps = sum(1 for _ in factor.compliance_steps(places, found, size, 1e-9))
+        assert steps > 4
+        assert norm(found - exact) < 1e-5 * norm(exact)
+
+
 def test_a_body_without_reflections_has_one_factor():
     mesh = fem.box([4.0, 1.0, 1.0], [9, 3, 3])
     x, y, z = mesh.p

@@ -56,6 +56,63 @@ def test_a_translated_patch_is_a_moved_support(scene, sim):
     assert np.abs(found.displacement - exact).max() < 1e-7 * L
 
 
+SIDE = fem.Box([20, 0, 25], [55, 25, 25])  # a part of the upper side
+
+
+def test_two_grippers_move_their_patches_each_on_its_own(scene, sim):
+    moves = [[1.0, 6.0, 3.0], [0.0, 0.5, None]]
+    found = sim.grasp([END, SIDE], moves, tol=1e-9)
+    exact = with_supports(scene, *map(fem.DirichletBC, [END, SIDE], moves))
+    assert found.converged
+    assert np.abs(found.displacement - exact).max() < 1e-7 * L
+    assert np.allclose(found.force.sum(axis=0), found.nodal_force.sum(axis=0))
+    assert found.force[1, 2] == 0
+    assert found.force.shape == found.moment.shape == (2, 3)
+    assert found.force_error.shape == found.moment_error.shape == (2,)
+    turned = sim.grasp([END, SIDE], moves, [ROTATION, None], tol=1e-9)
+    assert np.linalg.norm(turned.moment[0] - found.moment[0]) > 0.1 * np.linalg.norm(
+        found.moment[0]
+    )
+    alone = sim.grasp([END], [TRANSLATION], [ROTATION])
+    same = sim.grasp(END, TRANSLATION, ROTATION)
+    assert np.array_equal(alone.force, same.force[None])
+    assert np.array_equal(alone.displacement, same.displacement)
+
+
+def stiffness_by_differences(sim, regions, at):
+    """Return force and moment by translation and rotation at a motion, (P, 6), over their size."""
+    columns, small = [], 1e-3
+    for motion in small * np.eye(at.size):
+        ends = []
+        for step in (motion, -motion):
+            moves, turns = np.split(at + step.reshape(at.shape), 2, axis=1)
+            answer = sim.grasp(regions, moves.tolist(), turns.tolist(), tol=1e-10)
+            ends.append(np.hstack([answer.force, answer.moment]).ravel())
+        columns.append((ends[0] - ends[1]) / (2 * small))
+    matrix = np.array(columns).T
+    return matrix, np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
+
+
+@pytest.mark.parametrize("regions", [[END], [END, SIDE]])
+def test_the_stiffness_is_that_of_small_motions(sim, regions):
+    """It is symmetric and positive, as the energy of the body is."""
+    rest = np.zeros((len(regions), 6))
+    exact, size = stiffness_by_differences(sim, regions, rest)
+    found = sim.grasp(regions, rest[:, :3].tolist()).stiffness / size
+    assert np.array_equal(found, found.T)
+    assert np.linalg.eigvalsh(found)[0] > 0
+    assert np.allclose(found, exact / size, rtol=0, atol=1e-4)
+
+
+def test_the_stiffness_turns_with_the_patch(sim):
+    """At a twist of 0.3 rad it differs by up to 15 % from that of the deformed body."""
+    at = np.array([[0.0, 1.0, 0.5, 0.3, 0.0, 0.0]])
+    exact, size = stiffness_by_differences(sim, [END], at)
+    found = sim.grasp([END], at[:, :3], at[:, 3:]).stiffness
+    assert np.allclose(found, found.T, rtol=0, atol=1e-12 * size.max())
+    assert np.allclose(found / size, exact / size, rtol=0, atol=0.15)
+
+
 def test_a_direction_without_a_value_is_free(scene, sim):
     found = sim.grasp(END, [None, 6.0, None], tol=1e-9)
     exact = with_supports(scene, fem.DirichletBC(END, [None, 6.0, None]))
@@ -428,6 +485,8 @@ REFUSED = [
     ((END, STILL), {"tol": 2.0}, "tol"),
     ((END, STILL), {"young": -1.0}, "young"),
     ((END, STILL), {"budget_ms": 0}, "budget_ms"),
+    (([END, SIDE], [STILL]), {}, "lengths"),
+    (([END, END], [STILL, STILL]), {}, "in common"),
 ]
 
 

@@ -82,3 +82,12 @@ def test_one_slow_run_does_not_prevent_a_stage_for_ever():
     while request.over("iteration"):
         refused += 1
     assert 100 < refused < 5000
+
+
+def test_refusals_of_a_stage_without_a_time_do_not_hide_its_first_time():
+    durations = Durations()
+    request = Request(budget_ms=1.0, durations=durations)
+    durations.add(FINISH, 10.0)
+    assert all(request.over("iteration") for _ in range(30))
+    durations.add("iteration", 5.0)
+    assert durations.forecast("iteration") == 5.0

@@ -16,7 +16,7 @@ Duff, Reid (1983), The multifrontal solution of indefinite sparse symmetric line
 Trans. Math. Softw. 9 (fronts); Guyan (1965), AIAA J. 3 (static condensation).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -236,6 +236,30 @@ def condensed_solves(table, unknowns, values, forces, solutions):  # type: ignor
             subtract_product(X.reshape((count, len(boundary))), take(solution, boundary), own)
             for i in range(count):
                 solution[pivots[i]] = own[i]
+
+
+def add_inverses(
+    blocks: Condensed, unknowns: Integers, signs: NDArray[np.float64], out: NDArray[np.float64]
+) -> Iterator[None]:
+    """Add S A^-1 S at k unknowns of each matrix A to `out` (k, k), in a step for each front.
+
+    S is the diagonal of `signs`, (P, k). With A = L D L^T the inverse is (L^-1)^T D^-1 L^-1, so
+    that only the forward pass is made, for all columns at once and in the dtype of the blocks.
+    """
+    size = len(np.unique(blocks.unknowns))
+    for values, own in zip(blocks.values, signs, strict=True):
+        forces = np.zeros((size, len(unknowns)), values.dtype)
+        forces[unknowns, np.arange(len(unknowns))] = own
+        for first, middle, last, place in blocks.table.tolist():
+            pivots, boundary = blocks.unknowns[first:middle], blocks.unknowns[middle:last]
+            acting = np.flatnonzero(forces[pivots].any(axis=0))
+            if not len(acting):
+                continue
+            count, right = len(pivots), forces[pivots[:, None], acting]
+            inverse, X = np.split(values[place : place + count * (last - first)], [count * count])
+            out[acting[:, None], acting] += right.T @ (inverse.reshape(count, count) @ right)
+            forces[boundary[:, None], acting] -= X.reshape(count, len(boundary)).T @ right
+            yield
 
 
 class Layer(NamedTuple):

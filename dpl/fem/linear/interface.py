@@ -1,6 +1,7 @@
 """Interface of the linear backends, their exception, products with symmetric matrices."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
@@ -33,6 +34,7 @@ class SingularMatrix(ArithmeticError):
     """The matrix has no usable factorisation, or an iterative solve does not converge."""
 
 
+BLOCK = 8  # right-hand sides of one step of a compliance
 UNKNOWN = -1  # number of negative eigenvalues that is not known
 
 
@@ -70,6 +72,19 @@ class Factor(ABC):
     def solve_many(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return the solutions, (k, n), of right-hand sides (k, n), see `solve`."""
         return np.array([self.solve(row, rtol) for row in right]).reshape(right.shape)
+
+    def compliance_steps(
+        self, places: NDArray[np.int64], out: Array, size: int, rtol: float
+    ) -> Iterator[None]:
+        """Set `out` (m, m), zeros, to the entries of K^-1, (n, n), at some places in short steps.
+
+        `size` is n; see `solve` for `rtol`.
+        """
+        for rows in np.split(np.arange(len(places)), range(BLOCK, len(places), BLOCK)):
+            right = np.zeros((len(rows), size))
+            right[np.arange(len(rows)), places[rows]] = 1.0
+            out[rows] = self.solve_many(right, rtol)[:, places]
+            yield
 
 
 class Backend(Protocol):

@@ -51,7 +51,7 @@ class AndersonSolver:
         u = torch.where(problem.free, guess, problem.prescribed)
         factor: CorotatedFactor | None = None
         residuals: list[float] = []
-        right = step = np.zeros(problem.pattern.size)
+        right = step = np.zeros(len(problem.discretisation.free_numbers))
         steps, changes = (deque[Array](maxlen=self.memory) for _ in range(2))
         for count in range(self.max_iter + 1):
             evaluation = problem.evaluate(u)

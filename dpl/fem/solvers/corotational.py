@@ -86,15 +86,21 @@ class CorotatedFactor(Factor):
     rotations: Array  # rotations R of the nodes, (N, 3, 3)
     numbers: NDArray[np.int64]  # numbers of the free degrees of freedom, else -1, (N, 3)
 
+    def local(self, values: Array) -> Array:
+        """Return R^T times values at free degrees of freedom, (n,)."""
+        return _rotated(self.rotations.mT, self.numbers, values)
+
+    def turned(self, values: Array) -> Array:
+        """Return R times values at free degrees of freedom, (n,)."""
+        return _rotated(self.rotations, self.numbers, values)
+
     def apply(self, right: Array) -> Array:
         """Return R M R^T right, (n,), M the inverse of K(0) or its preconditioner."""
-        found = self.factor.apply(_rotated(self.rotations.mT, self.numbers, right))
-        return _rotated(self.rotations, self.numbers, found)
+        return self.turned(self.factor.apply(self.local(right)))
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return R K(0)^-1 R^T right, (n,), to a relative residual, see `Factor.solve`."""
-        found = self.factor.solve(_rotated(self.rotations.mT, self.numbers, right), rtol)
-        return _rotated(self.rotations, self.numbers, found)
+        return self.turned(self.factor.solve(self.local(right), rtol))
 
 
 # One explicit signature each: numba's cache can mix up the machine code of several signatures of a

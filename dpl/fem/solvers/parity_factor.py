@@ -5,6 +5,7 @@ symmetries the blocks have fewer entries than those of the whole matrix, and a s
 fewer.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Self
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import block_diag, coo_array, csr_array, dia_array
 from torch import Tensor
 
-from dpl.fem.linear.condensation import Condensed, condense, condensed_solves
+from dpl.fem.linear.condensation import Condensed, add_inverses, condense, condensed_solves
 from dpl.fem.linear.interface import Array, Factor, full_matrix
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
@@ -88,6 +89,18 @@ class ParityFactor(Factor):
         x = np.empty_like(right)
         x[images] = signs * (characters.T @ solved)
         return x
+
+    def compliance_steps(
+        self, places: NDArray[np.int64], out: Array, size: int, rtol: float
+    ) -> Iterator[None]:
+        """Set the entries of K^-1 at some places, see `Factor.compliance_steps`."""
+        images, _, scales, characters = self._arrays
+        order = np.argsort(images, axis=None)
+        found = order[np.searchsorted(images.ravel()[order], places)]
+        orbit = found % images.shape[1]  # of the values at the places
+        own = np.where(images[:, orbit] == places, scales[:, orbit], 0.0)  # (M, k)
+        shares = characters @ own
+        return add_inverses(self.blocks, orbit, shares, out)
 
     @cached_property
     def _arrays(self) -> tuple[NDArray[np.int64], Array, Array, Array]:

@@ -1,14 +1,15 @@
-"""A patch of the boundary that a gripper holds: its rigid motion, its compliance, the held body."""
+"""Patches of the boundary that grippers hold: rigid motions, compliance, the held body."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import chain
 from typing import NamedTuple, Self
 
 import numpy as np
 import skfem
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import pad
@@ -20,11 +21,12 @@ from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.newton import Newton
 
 RTOL = 1e-6  # relative residual of the linear solutions that give the compliance [-]
+RIGID = 0.1  # part of a displacement of the patch that is no rigid motion and is neglected [-]
 FACING = 0.966  # smallest cosine, of 15 degrees, between a facet's normal and the axis it faces [-]
 
 
 class Wrench(NamedTuple):
-    """Force (D,) [-] of a gripper, and moment (3,), in 2D (1,) [-], about the displaced centre."""
+    """Forces (P, D) [-], and moments (P, 3), in 2D (P, 1) [-], about the displaced centres."""
 
     force: Tensor
     moment: Tensor
@@ -32,15 +34,17 @@ class Wrench(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RigidPatch:
-    """Nodes of the boundary that move together as a rigid body, in all directions or in some.
+    """Nodes of the boundary that move as P rigid bodies, in all directions or in some.
 
     Attributes:
-        linear: Linear solver of the body without the gripper.
+        linear: Linear solver of the body without grippers.
         held: Degrees of freedom whose displacement is prescribed, (N, D), boolean.
+        parts: Masks of the nodes of each rigid body, (P, N).
     """
 
     linear: LinearSolver
     held: Tensor
+    parts: Tensor
 
     @classmethod
     def of(
@@ -81,7 +85,20 @@ class RigidPatch:
         held = nodes[:, None] & torch.tensor(held_axes) & problem.free
         if not held.any():
             raise ValueError("region: no node of the boundary in it is free to move")
-        return cls(linear, held)
+        return cls(linear, held, held.any(dim=1)[None])
+
+    @classmethod
+    def union(cls, patches: Sequence[Self]) -> Self:
+        """Return several patches of one body as one, whose parts have their own motions.
+
+        Raises:
+            ValueError: Two patches have a node in common.
+        """
+        parts = torch.cat([patch.parts for patch in patches])
+        if (parts.sum(dim=0) > 1).any():
+            raise ValueError("region: two patches have a node in common; grasp them apart")
+        held = torch.stack([patch.held for patch in patches]).any(dim=0)
+        return cls(patches[0].linear, held, parts)
 
     @property
     def problem(self) -> Problem:
@@ -93,24 +110,43 @@ class RigidPatch:
         """Mask of the held nodes, (N,)."""
         return self.held.any(dim=1)
 
-    def displacement(self, translation: Sequence[float], rotation: Sequence[float]) -> Tensor:
+    def displacement(self, translation: ArrayLike, rotation: ArrayLike) -> Tensor:
         """Return the displacement of the held degrees of freedom, (m,) [-].
 
-        The translation (D,) [-] is that of the mean of the held nodes. The rotation vector about it
-        is (3,), in 2D the angle, (1,) [rad].
+        The translations (P, D) [-] are those of the means of the held nodes. The rotation vectors
+        about them are (P, 3), in 2D the angles, (P, 1) [rad]. One part may leave out P.
         """
-        points = self.problem.points[self.nodes]
-        arms = points - points.mean(dim=0)
-        dim = points.shape[1]
-        vector = rotation if dim == 3 else [0.0, 0.0, *rotation]
-        quaternion = torch.from_numpy(Rotation.from_rotvec(vector).as_quat())
-        axis, cosine = quaternion[None, :3], quaternion[3]
-        arms = pad(arms, (0, 3 - dim))
-        # (R - I) r without the rounding of R, which exceeds a small rotation
-        across = torch.linalg.cross(axis, arms)
-        turned = 2 * (cosine * across + torch.linalg.cross(axis, across))
-        moved = turned[:, :dim] + torch.tensor(translation, dtype=torch.float64)
-        return moved[self.held[self.nodes]]
+        dim = self.held.shape[1]
+        translations = torch.as_tensor(translation, dtype=torch.float64).reshape(-1, dim)
+        turns = rotations(torch.as_tensor(rotation, dtype=torch.float64), dim).as_quat()
+        field = torch.zeros(self.held.shape, dtype=torch.float64)
+        for part, moved, turn in zip(self.parts, translations, turns, strict=True):
+            quaternion = torch.from_numpy(turn)
+            axis, cosine = quaternion[None, :3], quaternion[3]
+            # (R - I) r without the rounding of R, which exceeds a small rotation
+            across = torch.linalg.cross(axis, self._arms(part))
+            turned = 2 * (cosine * across + torch.linalg.cross(axis, across))
+            field[part] = turned[:, :dim] + moved
+        return self.of_field(field)
+
+    def _arms(self, part: Tensor) -> Tensor:
+        """Return the nodes of a part relative to their mean, (k, 3) [-]; 2D: with zeros."""
+        points = self.problem.points[part]
+        return pad(points - points.mean(dim=0), (0, 3 - points.shape[1]))
+
+    @cached_property
+    def rigid_motions(self) -> Tensor:
+        """Displacements (m, P R) by unit translations and rotations of the parts, one by one."""
+        dim, columns = self.held.shape[1], []
+        for part in self.parts:
+            arms, units = self._arms(part), torch.eye(3, dtype=torch.float64)
+            turned = [torch.linalg.cross(axis[None].expand_as(arms), arms) for axis in units]
+            moved = [axis.expand_as(arms) for axis in units[:dim]]
+            for one in (*moved, *turned[0 if dim == 3 else 2 :]):
+                field = torch.zeros(self.held.shape, dtype=torch.float64)
+                field[part] = one[:, :dim]
+                columns.append(self.of_field(field))
+        return torch.stack(columns, dim=1)
 
     def at(self, values: Tensor) -> Tensor:
         """Return the nodal field, (N, D), with values (m,) at held degrees of freedom, else 0."""
@@ -131,32 +167,84 @@ class RigidPatch:
         """Numbers of the held ones among the free degrees of freedom, (m,)."""
         return np.flatnonzero(self.held[self.problem.free].numpy())
 
-    @property
-    def missing_rows(self) -> int:
-        """Number of rows of the compliance that are not computed."""
-        return len(self.places) - sum(map(len, self._rows))
+    @cached_property
+    def preparation(self) -> Iterator[None]:
+        """Short steps that compute all that motions need; a second loop continues the first."""
+        return chain(self._compliance_steps, self._field_steps())
 
-    def prepare(self, *, one: bool = False) -> None:
-        """Compute the rows of the compliance that are left, or the next one."""
-        places = self.places[len(self.places) - self.missing_rows :][: 1 if one else None]
-        right = np.zeros((len(places), self.problem.pattern.size))
-        right[np.arange(len(places)), places] = 1.0
-        factor = self.linear.float32_factor  # a block of one row takes longer than one solve
-        rows = factor.solve(right[0], RTOL)[None] if one else factor.solve_many(right, RTOL)
-        self._rows.append(torch.from_numpy(rows[:, self.places]))
+    @property
+    def is_prepared(self) -> bool:
+        """True if the steps of the preparation are made."""
+        return len(self._fields) == self.rigid_motions.shape[1]
 
     @cached_property
-    def _rows(self) -> list[Tensor]:
-        """Rows of the compliance that are computed, (k, m) each."""
-        return []
+    def _compliance_steps(self) -> Iterator[None]:
+        """Steps that compute the compliance."""
+        size = len(self.problem.discretisation.free_numbers)
+        factor = self.linear.float32_factor
+        return factor.compliance_steps(self.places, self._compliance, size, RTOL)
+
+    @cached_property
+    def _compliance(self) -> Array:
+        """Linear displacements of the patch by unit forces on it, (m, m), once computed."""
+        return np.zeros((len(self.places),) * 2)
 
     @cached_property
     def compliance_factor(self) -> Tensor:
         """Cholesky factor of the linear displacements of the patch by forces on it, (m, m)."""
-        if self.missing_rows:
-            self.prepare()
-        compliance = torch.cat(self._rows)
+        for _ in self._compliance_steps:
+            pass
+        compliance = torch.from_numpy(self._compliance)
         return torch.linalg.cholesky((compliance + compliance.mT) / 2)
+
+    def _field_steps(self) -> Iterator[None]:
+        """Compute the rigid fields one by one."""
+        problem, factor = self.problem, self.linear.float32_factor
+        for force in torch.cholesky_solve(self.rigid_motions, self.compliance_factor).T:
+            self._fields.append(factor.solve(problem.restrict(self.at(force))))
+            yield
+
+    @cached_property
+    def _fields(self) -> list[Array]:
+        """The rigid fields that are computed, (n,) each."""
+        return []
+
+    @cached_property
+    def rigid_fields(self) -> Array:
+        """Linear displacements of the body by `rigid_motions`, (P R, n)."""
+        for _ in self.preparation:
+            pass
+        return np.stack(self._fields)
+
+    @cached_property
+    def _stiffness(self) -> Tensor:
+        """Forces on the linear body at rest by `rigid_motions`, in the same order, (P R, P R)."""
+        motions = self.rigid_motions
+        matrix = motions.mT @ torch.cholesky_solve(motions, self.compliance_factor)
+        return (matrix + matrix.mT) / 2
+
+    def stiffness(self, turns: Tensor) -> Tensor:
+        """Return forces and moments by translations and rotations of the parts, (P R, P R) [-].
+
+        They are those of the linear body, turned with the patch: each part by its rotation, (P, D,
+        D). The matrix is symmetric.
+        """
+        about = turns if turns.shape[1] == 3 else turns.new_ones(len(turns), 1, 1)
+        pairs = zip(turns, about, strict=True)
+        frame = torch.block_diag(*(matrix for pair in pairs for matrix in pair))
+        return frame @ self._stiffness @ frame.mT
+
+    def work(self, force: Tensor, displacement: Tensor, turns: Tensor) -> Wrench:
+        """Return the work of nodal forces (N, D) [-] by unit motions of the parts.
+
+        The fields are `rigid_fields` in the rotated frames of the nodes at a displacement (N, D),
+        and the motions those of parts that are turned, (P, D, D).
+        """
+        dim, frames = force.shape[1], self.linear.corotational.at(displacement[None])
+        works = self.rigid_fields @ frames.local(self.problem.restrict(force))
+        along, about = torch.from_numpy(works.reshape(len(turns), -1, 1)).split(dim, dim=1)
+        about = turns @ about if dim == 3 else about
+        return Wrench((turns @ along)[..., 0], about[..., 0])
 
     def stiffness_times(self, displacement: Tensor) -> Tensor:
         """Return the forces, (m,), whose linear solution displaces the patch by (m,) [-]."""
@@ -186,25 +274,39 @@ class RigidPatch:
     def moved(self, displacement: Tensor, goal: Tensor) -> Tensor:
         """Return a displacement (N, D) whose patch is at a goal (m,), from one near it [-].
 
-        The difference is a linear displacement in the rotated frames of the nodes.
+        The difference is a linear displacement in the rotated frames of the nodes. It is a sum of
+        `rigid_fields` if the parts move by rigid motions, up to `RIGID` of the distance: a support
+        that jumps by the rest is at the goal, and the next correction removes its stresses.
         """
-        problem, dim = self.problem, displacement.shape[1]
-        frames = self.linear.corotational.at(displacement[None]).rotations
-        turns = torch.from_numpy(frames)[:, :dim, :dim]
-        missing = self.at(goal - self.of_field(displacement))
-        gap = (turns.mT @ missing[..., None])[..., 0]
-        force = problem.restrict(self.at(self.stiffness_times(self.of_field(gap))))
-        added = problem.extend(self.linear.float32_factor.solve(force))
-        return displacement + (turns @ added[..., None])[..., 0]
+        problem, frames = self.problem, self.linear.corotational.at(displacement[None])
+        missing = problem.restrict(self.at(goal - self.of_field(displacement)))
+        gap = torch.from_numpy(frames.local(missing)[self.places])
+        motions = self._motions_of @ gap
+        rest = gap - self.rigid_motions @ motions
+        if float(rest.abs().max()) <= RIGID * float(gap.abs().max()):
+            moved = displacement + problem.extend(
+                frames.turned(motions.numpy() @ self.rigid_fields)
+            )
+            return moved + self.at(goal - self.of_field(moved))
+        force = problem.restrict(self.at(self.stiffness_times(gap)))
+        added = frames.turned(self.linear.float32_factor.solve(force))
+        return displacement + problem.extend(added)
+
+    @cached_property
+    def _motions_of(self) -> Tensor:
+        """Least-squares motions by displacements of the patch, (P R, m)."""
+        return torch.linalg.pinv(self.rigid_motions)
 
     def wrench(self, force: Tensor, displacement: Tensor) -> Wrench:
-        """Return the resultant of nodal forces (N, D) [-] on the patch at a displacement (N, D)."""
-        forces = force[self.nodes]
-        place = (self.problem.points + displacement)[self.nodes]
-        missing = 3 - place.shape[1]
-        arms, pulls = pad(place - place.mean(dim=0), (0, missing)), pad(forces, (0, missing))
-        moment = torch.linalg.cross(arms, pulls).sum(dim=0)
-        return Wrench(forces.sum(dim=0), moment[2:] if missing else moment)
+        """Return the resultants of forces (N, D) [-] on the parts at a displacement (N, D) [-]."""
+        resultants, moments, missing = [], [], 3 - force.shape[1]
+        for part in self.parts:
+            place = (self.problem.points + displacement)[part]
+            arms = pad(place - place.mean(dim=0), (0, missing))
+            moment = torch.linalg.cross(arms, pad(force[part], (0, missing))).sum(dim=0)
+            resultants.append(force[part].sum(dim=0))
+            moments.append(moment[2:] if missing else moment)
+        return Wrench(torch.stack(resultants), torch.stack(moments))
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +340,12 @@ class _HeldFactor(Factor):
         moved = torch.from_numpy(factor.solve(force)[held])
         force[held] = -patch.stiffness_times(moved).numpy()
         return factor.solve(force)[~held]
+
+
+def rotations(vectors: Tensor, dim: int) -> Rotation:
+    """Return rotations by vectors (P, 3), in 2D by angles (P, 1) [rad]."""
+    vectors = vectors.reshape(-1, 3 if dim == 3 else 1)
+    return Rotation.from_rotvec(pad(vectors, (3 - vectors.shape[1], 0)).numpy())
 
 
 def flat_part(problem: Problem, nodes: Tensor) -> tuple[Tensor, int]:
