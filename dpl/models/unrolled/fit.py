@@ -150,14 +150,28 @@ def _chunks(samples: Sample) -> Iterator[Sample]:
     return map(Sample._make, zip(*(column.split(CHUNK) for column in samples), strict=True))
 
 
-def choose_cells(images: Tensor, count: int) -> Tensor:
-    """Return random cells (C,), C >= count if there are as many, with all their images (G, E)."""
-    orbit = images.amin(dim=0)  # smallest number of a cell of the orbit
-    names = orbit.unique()
-    order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
-    sizes = torch.bincount(orbit, minlength=len(orbit))[order]
-    taken = int((sizes.cumsum(0) < count).sum()) + 1
-    return torch.isin(orbit, order[:taken]).nonzero()[:, 0]
+def choose_cells(images: Tensor, centres: Tensor, count: int) -> Tensor:
+    """Return cells (C,) that cover the body evenly, with all their images.
+
+    Each further cell is the one farthest from those before and their images. C >= `count`, if there
+    are as many cells.
+
+    Source: Gonzalez (1985), Clustering to minimize the maximum intercluster distance, Theor.
+    Comput. Sci. 38.
+
+    Args:
+        images: Numbers of the images of each cell under the symmetries, (G, E).
+        centres: Centres of the cells, (E, D).
+        count: Wanted number of cells.
+    """
+    distance = (centres - centres.mean(dim=0)).norm(dim=1)  # the first cell is an outer one
+    taken = torch.zeros(len(centres), dtype=torch.bool)
+    while int(taken.sum()) < min(count, len(centres)):
+        orbit = images[:, distance.argmax()].unique()
+        taken[orbit] = True
+        distance = torch.minimum(distance, torch.cdist(centres, centres[orbit]).amin(dim=1))
+        distance[taken] = -1.0
+    return taken.nonzero()[:, 0]
 
 
 def maps_at_cells(
@@ -246,7 +260,8 @@ def fit_maps(
     images = linear.group.cell_images(problem)
     fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])
     parity_of_fields = torch.cat([parity, torch.zeros(1, dtype=torch.int64)])
-    numbers = choose_cells(images, cells)
+    centres = problem.points[problem.cells].mean(dim=1)
+    numbers = choose_cells(images, centres, cells)
     positions = torch.searchsorted(numbers, images[:, numbers])
     symmetry = MapParities(parities, positions[parities.members], parity)
     gradients = cell_gradients(problem, fields, numbers)
