@@ -24,6 +24,7 @@ def nodal_fields(
                 f"{name}displacement [m]": scene.length * u,
                 f"{name}Cauchy stress [Pa]": young * stress.stress[0],
                 f"{name}von Mises stress [Pa]": young * stress.von_mises[0],
+                f"{name}pressure [Pa]": young * stress.pressure[0],
                 f"{name}det F": stress.volume_ratio[0],
             }
     if reference is not None:

@@ -128,12 +128,14 @@ class SignedOrbits(NamedTuple):
 
     def products(self, values: Tensor, characters: Tensor) -> Tensor:
         """Return products (..., m) of values (..., n) with the field of a parity of each orbit."""
-        rows = zip(characters, self.sign, self.images, strict=True)
-        products = sum(
-            (factor * sign * self.weight).to(values) * values[..., index]
-            for factor, sign, index in rows
-        )
-        return torch.where(self._allowed(characters), products, 0.0)  # also against rounding
+        rows = values.movedim(-1, 0).contiguous()  # selected in whole pieces of memory
+        shape = -1, *(1 for _ in rows.shape[1:])
+        products = rows.new_zeros(self.images.shape[1], *rows.shape[1:])
+        for factor, sign, index in zip(characters, self.sign, self.images, strict=True):
+            one = (factor * sign * self.weight).to(rows).view(shape)
+            products.addcmul_(one, rows.index_select(0, index))
+        allowed = self._allowed(characters).view(shape)
+        return torch.where(allowed, products, 0.0).movedim(0, -1)  # also against rounding
 
     def _allowed(self, characters: Tensor) -> Tensor:
         """Return the mask (m,) of orbits whose values a parity allows to be other than zero."""

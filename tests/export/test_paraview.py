@@ -71,6 +71,7 @@ def test_series_contain_the_fields_of_the_predictions_in_si_units(make_scene_of,
         stress = data["Cauchy stress [Pa]"].reshape(nodes, 3, 3)
         assert np.allclose(stress, 4500.0 * inside.stress[k].numpy())
         assert np.allclose(data["von Mises stress [Pa]"], 4500.0 * inside.von_mises[k].numpy())
+        assert np.allclose(data["pressure [Pa]"], 4500.0 * inside.pressure[k].numpy())
         assert np.allclose(data["det F"], inside.volume_ratio[k].numpy())
         exact = data["reference displacement [m]"][:, :dim] / scene.length
         known = fields(scene.problem, torch.from_numpy(exact)[None])

@@ -45,6 +45,7 @@ def test_a_uniform_stretch_has_the_cauchy_stress_of_its_law_at_every_node(cell, 
     assert found.stress.shape == (1, len(problem.points), 3, 3)
     assert np.abs(found.stress.numpy() - expected).max() < 1e-13
     assert np.abs(found.von_mises.numpy() - math.sqrt(1.5 * (s * s).sum())).max() < 1e-13
+    assert np.abs(found.pressure.numpy() + np.trace(expected) / 3).max() < 1e-13
     assert np.abs(found.volume_ratio.numpy() - J).max() < 1e-13
 
 

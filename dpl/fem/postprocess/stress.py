@@ -1,4 +1,4 @@
-"""Cauchy stress, von Mises stress and volume ratio at quadrature points and nodes."""
+"""Cauchy stress, von Mises stress, pressure and volume ratio at quadrature points and nodes."""
 
 from typing import NamedTuple
 
@@ -14,16 +14,19 @@ class Fields(NamedTuple):
     Attributes:
         stress: Cauchy stress over E, (B, N, 3, 3) [-].
         von_mises: Von Mises stress over E, (B, N) [-].
+        pressure: -tr(stress) / 3 over E, (B, N) [-]; that of cells with mean dilatation is nearly
+            constant in each.
         volume_ratio: det F, (B, N) [-].
     """
 
     stress: Tensor
     von_mises: Tensor
+    pressure: Tensor
     volume_ratio: Tensor
 
 
 def fields(problem: Problem, displacement: Tensor) -> Fields:
-    """Return stress and volume ratio at the nodes under displacements (B, N, D) [-].
+    """Return stress, pressure and volume ratio at the nodes under displacements (B, N, D) [-].
 
     A nodal value is that of a linear function, fitted to the values in the cells around the node
     (Zienkiewicz, Zhu 1992), see `dpl.fem.assembly.recovery.Recovery.build`. It is exact for values
@@ -33,7 +36,8 @@ def fields(problem: Problem, displacement: Tensor) -> Fields:
     """
     stress = problem.recovery(cauchy(problem, displacement))
     volume_ratio = torch.linalg.det(_deformation_gradient(problem, displacement))
-    return Fields(stress, von_mises(stress), problem.recovery(volume_ratio))
+    pressure = -stress.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
+    return Fields(stress, von_mises(stress), pressure, problem.recovery(volume_ratio))
 
 
 def _deformation_gradient(problem: Problem, displacement: Tensor) -> Tensor:

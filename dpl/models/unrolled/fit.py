@@ -150,14 +150,28 @@ def _chunks(samples: Sample) -> Iterator[Sample]:
     return map(Sample._make, zip(*(column.split(CHUNK) for column in samples), strict=True))
 
 
-def choose_cells(images: Tensor, count: int) -> Tensor:
-    """Return random cells (C,), C >= count if there are as many, with all their images (G, E)."""
-    orbit = images.amin(dim=0)  # smallest number of a cell of the orbit
-    names = orbit.unique()
-    order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
-    sizes = torch.bincount(orbit, minlength=len(orbit))[order]
-    taken = int((sizes.cumsum(0) < count).sum()) + 1
-    return torch.isin(orbit, order[:taken]).nonzero()[:, 0]
+def choose_cells(images: Tensor, centres: Tensor, count: int) -> Tensor:
+    """Return cells (C,) that cover the body evenly, with all their images.
+
+    Each further cell is the one farthest from those before and their images. C >= `count`, if there
+    are as many cells.
+
+    Source: Gonzalez (1985), Clustering to minimize the maximum intercluster distance, Theor.
+    Comput. Sci. 38.
+
+    Args:
+        images: Numbers of the images of each cell under the symmetries, (G, E).
+        centres: Centres of the cells, (E, D).
+        count: Wanted number of cells.
+    """
+    distance = (centres - centres.mean(dim=0)).norm(dim=1)  # the first cell is an outer one
+    taken = torch.zeros(len(centres), dtype=torch.bool)
+    while int(taken.sum()) < min(count, len(centres)):
+        orbit = images[:, distance.argmax()].unique()
+        taken[orbit] = True
+        distance = torch.minimum(distance, torch.cdist(centres, centres[orbit]).amin(dim=1))
+        distance[taken] = -1.0
+    return taken.nonzero()[:, 0]
 
 
 def maps_at_cells(
@@ -169,15 +183,15 @@ def maps_at_cells(
     *,
     copies: int,
     stages: int,
-) -> tuple[float, Maps, Tensor]:
+) -> tuple[Maps, Tensor]:
     """Fit maps one after the other, as long as the held-out error decreases enough.
 
     A map that is fitted to few samples predicts them better than others. The next map is therefore
     fitted to states of each sample that follow from maps which are fitted to the other samples.
 
     Returns:
-        The weighted held-out error, the maps, and what they miss of the held-out targets, (S, R).
-        The map is zero if none is good enough.
+        The maps, and what they miss of the held-out targets, (S, R). The first map is zero if none
+        is good enough.
     """
     (fitted, held), (count, dim, _) = sets, cells.gradients.shape[1:]
     matrices, limits = list[Tensor](), list[Tensor]()
@@ -204,7 +218,7 @@ def maps_at_cells(
     if not matrices:
         matrices = [torch.zeros(count * dim * dim, fitted.linear.shape[1], dtype=torch.float64)]
         limits = [torch.tensor(1.0, dtype=torch.float64)]
-    return error, Maps(cells, matrices, torch.stack(limits)), held.target - present[1]
+    return Maps(cells, matrices, torch.stack(limits)), held.target - present[1]
 
 
 def _features(law: Material, cells: SampleCells, samples: Columns, c: Tensor | None) -> Tensor:
@@ -232,9 +246,7 @@ def fit_maps(
     cells: int,
     stages: int,
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Return buffers of the maps with the smallest held-out error, and what they miss, (S, R).
-
-    Half as many cells are tried as long as that is better.
+    """Return buffers of the maps at sample cells, and what they miss of held-out targets, (S, R).
 
     Args:
         linear: Linear solutions of the body.
@@ -242,34 +254,28 @@ def fit_maps(
         inverse: (V^T K(0) V)^-1, (R, R).
         sets: Samples to fit to, and to choose by.
         copies: Number of images of each sample in the first set, see `fit_map`.
-        cells, stages: Largest numbers of sample cells, and of maps after the first.
+        cells, stages: Numbers of sample cells, and largest number of maps after the first.
     """
     problem, parities = linear.scene.problem, linear.form.parities
     images = linear.group.cell_images(problem)
     fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])
     parity_of_fields = torch.cat([parity, torch.zeros(1, dtype=torch.int64)])
-    best: tuple[float, Tensor, Maps, Tensor] | None = None
-    while cells:
-        numbers = choose_cells(images, cells)
-        positions = torch.searchsorted(numbers, images[:, numbers])
-        symmetry = MapParities(parities, positions[parities.members], parity)
-        gradients = cell_gradients(problem, fields, numbers)
-        columns = symmetry.orbits(1).symmetrised(gradients.flatten(1).T, parity_of_fields, parities)
-        # rounded before the fit: the maps cancel digits, so that G must stay what it is
-        sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
-        law = problem.material.of_cells(numbers).centred()
-        priors = mechanical_maps(problem, numbers, sample_cells.gradients[:-1], inverse)
-        options = {"copies": copies, "stages": stages}
-        error, maps, missed = maps_at_cells(law, sample_cells, symmetry, priors, sets, **options)
-        if best is not None and error >= best[0]:
-            break
-        best, cells = (error, numbers, maps, missed), cells // 2
-    assert best is not None
-    _, numbers, maps, missed = best
+    centres = problem.points[problem.cells].mean(dim=1)
+    numbers = choose_cells(images, centres, cells)
+    positions = torch.searchsorted(numbers, images[:, numbers])
+    symmetry = MapParities(parities, positions[parities.members], parity)
+    gradients = cell_gradients(problem, fields, numbers)
+    columns = symmetry.orbits(1).symmetrised(gradients.flatten(1).T, parity_of_fields, parities)
+    # rounded before the fit: the maps cancel digits, so that G must stay what it is
+    sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
+    law = problem.material.of_cells(numbers).centred()
+    priors = mechanical_maps(problem, numbers, sample_cells.gradients[:-1], inverse)
+    options = {"copies": copies, "stages": stages}
+    maps, missed = maps_at_cells(law, sample_cells, symmetry, priors, sets, **options)
     first, *others = (one.float() for one in maps.matrices)
     buffers = {
         "cells": numbers,
-        "gradients": maps.cells.gradients,
+        "gradients": sample_cells.gradients,
         "first_map": first,
         "maps": torch.stack(others) if others else first.new_zeros(0, 2 * len(first), len(parity)),
         "limits": maps.limits,
@@ -280,7 +286,7 @@ def fit_maps(
 def fit_in_best_modes(
     linear: LinearResponse, both: tuple[Sample, Sample], *, rank: int, cells: int, stages: int
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Fit the maps in all modes, in half and in a quarter of them.
+    """Fit the maps at all cells and at half as many, then in more modes, as long as that is better.
 
     The samples are those to fit to, and those to choose by. `rank`, `cells` and `stages` are the
     largest numbers of modes, of sample cells, and of maps after the first.
@@ -300,9 +306,9 @@ def fit_in_best_modes(
     inverses = [symmetry.inverse for symmetry in linear.group.coset_representatives()]
     few = inverses[: max(1, MAX_ROWS // len(rests[0]))]
     turned = [_image(every.T, one, free).T for one in few]
-    fits: list[tuple[float, dict[str, Tensor]]] = []
-    factors, count = terms.factors(problem.reference.material), every.shape[1]
-    while count:
+    factors = terms.factors(problem.reference.material)
+
+    def fit(count: int, cells: int) -> tuple[float, dict[str, Tensor]]:
         modes = every[:, :count]
         stiffness = ReducedStiffness(reduced_terms(terms, modes), terms)
         # coordinates of images of the samples are those of the samples in images of the modes
@@ -315,8 +321,18 @@ def fit_in_best_modes(
         found, missed = fit_maps(linear, modes, parity[:count], inverse, sets, **options)
         outside = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)
         square = missed.square().sum(dim=1) + outside.clamp(min=0)
-        error = float((square.sqrt() * held.weights).mean())
         own = {"modes": modes.float(), "parity": parity[:count], "stiffness": stiffness.parts}
-        fits.append((error, own | found))
-        count = count // 2 if count // 2 >= MIN_RANK else 0
-    return min(fits, key=lambda pair: pair[0])[1], every
+        return float((square.sqrt() * held.weights).mean()), own | found
+
+    counts = [every.shape[1]]
+    while counts[0] // 2 >= MIN_RANK:
+        counts.insert(0, counts[0] // 2)
+    best = fit(counts[0], cells)
+    while cells > 1 and (other := fit(counts[0], cells // 2))[0] < best[0]:
+        best, cells = other, cells // 2
+    for count in counts[1:]:
+        other = fit(count, cells)
+        if not other[0] < best[0]:
+            break
+        best = other
+    return best[1], every

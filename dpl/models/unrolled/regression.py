@@ -10,6 +10,7 @@ from dpl.fem.parity import Parities, SignedOrbits
 RIDGES = tuple(10.0**-k for k in range(16, 2, -1))  # relative to the mean square [-]
 ROUNDING = 1e-10  # norm of a feature over the largest below which it is rounding error
 LEAST = 1e-12  # part of a row that the other rows never predict [-]
+CHOOSING = 256  # samples whose left-out errors choose the ridge
 
 
 def weighted_error(error: Tensor, weights: Tensor) -> float:
@@ -74,53 +75,70 @@ def fit_map(
         ValueError: The rows are not finite.
     """
     orbits, weights = symmetry.orbits(features.shape[2]), weights[:, None]
-    features = features.flatten(1)
+    features = features.flatten(1).mT.contiguous().mT  # each column in one piece
     rest = targets - features @ prior
     if not (features.isfinite().all() and rest.isfinite().all()):
         raise ValueError("the samples are not finite")
-    squares, blocks = torch.zeros(len(RIDGES), len(rest)), []
+    squares, blocks, shifts = torch.zeros(1), [], rest.new_tensor(RIDGES)
     for p, characters in enumerate(symmetry.parities.characters):
         own = symmetry.coordinates == p
         X = weights * orbits.coordinates(features, characters)
-        errors, solved, basis = _ridge_path(X, weights * rest[:, own], images)
-        blocks.append((own, characters, errors, solved, basis))
+        block = _decomposed(X, weights * rest[:, own])
+        blocks.append((own, characters, block))
+        errors = _left_out(block, shifts, images, CHOOSING)
         squares = squares + errors.square().sum(dim=2)
-    chosen = int(squares.sqrt().mean(dim=1).argmin())
+    chosen = squares.sqrt().mean(dim=1).argmin()[None]
     matrix, left_out = torch.zeros_like(prior), torch.empty_like(rest)
-    for own, characters, errors, solved, basis in blocks:
-        change = basis @ solved[chosen]
+    for own, characters, block in blocks:
+        change = block.basis @ _solved(block, shifts[chosen])[0]
         matrix[:, own] = prior[:, own] + orbits.fields(change.T, characters, len(prior)).T
-        left_out[:, own] = errors[chosen]
+        left_out[:, own] = _left_out(block, shifts[chosen], images, len(rest))[0]
     left_out = left_out / weights.clamp(min=torch.finfo(torch.float64).tiny)
     return matrix, torch.where(weights > 0, left_out, targets - features @ matrix)
 
 
-def _ridge_path(X: Tensor, Y: Tensor, images: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return left-out errors (K, n, R), solutions (K, k, R) and their basis (p, k) for all ridges.
+class _Decomposed(NamedTuple):
+    """Regression of Y (n, R) on X (n, p) in the axes of X^T X or, with is_dual, of X X^T."""
 
-    X is (n, p) and Y is (n, R), with so many rows of each sample. The map of ridge number j is
-    `basis @ solutions[j]`. Columns that are zero or rounding errors, as at cells that symmetries
-    map onto themselves, have no effect. A regression with fewer rows than features is solved in as
-    many unknowns as rows: (X^T X + r)^-1 X^T Y = X^T (X X^T + r)^-1 Y.
+    values: Tensor  # eigenvalues over the number of columns, (k,)
+    rows: Tensor  # X in the axes, or the axes, (n, k)
+    basis: Tensor  # solutions in the axes become maps by it, (p, k)
+    targets: Tensor  # Y
+    is_dual: bool
+
+
+def _decomposed(X: Tensor, Y: Tensor) -> _Decomposed:
+    """Decompose the regression of Y (n, R) on X (n, p), each column divided by its norm.
+
+    Columns that are zero or rounding errors, as at cells that symmetries map onto themselves, have
+    no effect. A regression with fewer rows than features is solved in as many unknowns as rows:
+    (X^T X + r)^-1 X^T Y = X^T (X X^T + r)^-1 Y.
     """
     size = torch.linalg.vector_norm(X, dim=0)
     factors = torch.where(size > ROUNDING * size.max(), 1 / size, 0.0)
     X = X * factors
     is_dual = len(X) <= X.shape[1]
     values, Q = torch.linalg.eigh(X @ X.T if is_dual else X.T @ X)
-    T = Q if is_dual else X @ Q
-    shifts = X.shape[1] * X.new_tensor(RIDGES)[:, None]
-    inverse = 1 / (values.clamp(min=0) + shifts)  # (K, k)
-    solved = inverse[:, :, None] * (T.T @ Y)
-    fitted = T @ solved  # (K, n, R)
-    of_samples = T.unflatten(0, (images, -1))
-    rows = [[(a * b) @ inverse.T for b in of_samples] for a in of_samples]
-    products = torch.stack([torch.stack(row) for row in rows]).permute(3, 2, 0, 1)
-    one = torch.eye(images, dtype=X.dtype)
-    if is_dual:
-        error, part = fitted, products
-    else:
-        error, part = Y - fitted, (1 + LEAST) * one - products
-    own = error.unflatten(1, (images, -1)).transpose(1, 2)  # (K, S, images, R)
-    left_out = torch.linalg.solve(part, own).transpose(1, 2).flatten(1, 2)
-    return left_out, solved, factors[:, None] * (X.T @ Q if is_dual else Q)
+    basis = factors[:, None] * (X.T @ Q if is_dual else Q)
+    values = values.clamp(min=0) / max(X.shape[1], 1)
+    return _Decomposed(values, Q if is_dual else X @ Q, basis, Y, is_dual)
+
+
+def _solved(block: _Decomposed, ridges: Tensor) -> Tensor:
+    """Return the solutions (K, k, R) in the axes for K ridges."""
+    inverse = 1 / ((block.values + ridges[:, None]) * max(len(block.basis), 1))
+    return inverse[:, :, None] * (block.rows.T @ block.targets)
+
+
+def _left_out(block: _Decomposed, ridges: Tensor, images: int, count: int) -> Tensor:
+    """Return left-out errors (K, m, R) for K ridges, of images of the first `count` samples."""
+    inverse = 1 / ((block.values + ridges[:, None]) * max(len(block.basis), 1))  # (K, k)
+    T, Y = (part.unflatten(0, (images, -1))[:, :count] for part in (block.rows, block.targets))
+    fitted = T.flatten(0, 1) @ _solved(block, ridges)  # (K, m, R)
+    products = torch.stack([torch.stack([(a * b) @ inverse.T for b in T]) for a in T])
+    part, error = products.permute(3, 2, 0, 1), fitted  # (K, S, images, images)
+    if not block.is_dual:
+        one = torch.eye(images, dtype=T.dtype)
+        part, error = (1 + LEAST) * one - part, Y.flatten(0, 1) - fitted
+    own = error.unflatten(1, (images, -1)).transpose(1, 2)
+    return torch.linalg.solve(part, own).transpose(1, 2).flatten(1, 2)
