@@ -1,5 +1,6 @@
 """Conversion of the arguments of a call to float64 tensors and to a load."""
 
+import math
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any
@@ -88,7 +89,7 @@ def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
         words = f"({shape[0]}, {shape[1]}) or (B, {shape[0]}, {shape[1]})"
         raise ValueError(f"force: its shape is {tuple(force.shape)} and must be {words}")
     force = scene.problem.acting(force.reshape(-1, *shape))
-    largest = force.flatten(1).abs().amax(dim=1)
+    largest = torch.linalg.vector_norm(force.flatten(1), math.inf, dim=1)
     if not largest.isfinite().all():  # NaN if an entry is, also at fixed degrees of freedom
         raise ValueError("force: a number is not finite")
     low, high = scene.loads.moduli
@@ -100,8 +101,8 @@ def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
     for modulus in moduli.tolist():
         scene.problem.check_modulus(modulus)
     values = named_columns("parameters", parameters, list(scene.loads.parameter_ranges), len(force))
-    own = scene.problem.law_parameters(values)
-    scene.problem.material.with_parameters(own)  # refuses values that it does not allow
+    if scene.problem.material.parameter_ranges:  # it refuses values that it does not allow
+        scene.problem.material.with_parameters(scene.problem.law_parameters(values))
     sizes = largest / (moduli * scene.force_unit)
     is_lost = (sizes < FAINT) & (largest > 0)
     if is_lost.any() or not sizes.isfinite().all():
