@@ -25,7 +25,10 @@ def _add_normal_equations(shapes, force, unit, q, matrix, right):  # type: ignor
     """
     square = 0.0
     for n in range(len(force)):
-        if not force[n].any():
+        is_loaded = False
+        for i in range(force.shape[1]):
+            is_loaded = is_loaded or force[n, i] != 0
+        if not is_loaded:
             continue
         for i in range(force.shape[1]):
             rest = force[n, i] / unit
