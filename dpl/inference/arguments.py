@@ -1,6 +1,5 @@
 """Conversion of the arguments of a call to float64 tensors and to a load."""
 
-import math
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any
@@ -93,7 +92,8 @@ def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
         words = f"({shape[0]}, {shape[1]}) or (B, {shape[0]}, {shape[1]})"
         raise ValueError(f"force: its shape is {tuple(force.shape)} and must be {words}")
     force = scene.problem.acting(force.reshape(-1, *shape))
-    largest = torch.linalg.vector_norm(force.flatten(1), math.inf, dim=1).numpy()
+    rows = force.flatten(1).numpy()
+    largest = np.maximum(rows.max(axis=1), -rows.min(axis=1))
     if not np.isfinite(largest).all():  # NaN if an entry is, also at fixed degrees of freedom
         raise ValueError("force: a number is not finite")
     low, high = scene.loads.moduli

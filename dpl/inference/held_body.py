@@ -105,9 +105,9 @@ class HeldBody:
         tangent. The estimate then needs no products with the tangent.
         """
         patch, state, u = self.patch, candidate.state, candidate.state.displacement
-        evaluation, force = self.newton.problem.evaluate(u), candidate.force
+        force = candidate.force
         if force is None:
-            force = patch.of_field(evaluation.internal[0] - self.load.force[0])
+            force = patch.of_field(state.internal[0] - self.load.force[0])
         missed = float(patch.at(self.goal - patch.of_field(u[0])).norm(dim=1).max())
         candidate = candidate._replace(force=force, motion_error=missed)
         if request.over("errors"):
@@ -115,7 +115,7 @@ class HeldBody:
         products = 0 if candidate.known_error < CORRECTED_WARM else PRODUCTS
         with request.durations.timed("errors"):
             found = estimate_error(
-                self.newton.linear_solver, self.load, u, evaluation, products=products
+                self.newton.linear_solver, self.load, u, state.evaluation, products=products
             )
         largest = max(float(u.norm(dim=2).max()), 1e-300)
         return candidate._replace(

@@ -271,8 +271,8 @@ class Simulator:
             states = replace(self.scene.corrector, tol=tol).iterate(load)
         else:
             hybrid = default_hybrid(lambda load: start, self.scene, tol)
-            known = {"is_over": newton_is_over, "evaluation": nearest.evaluation}
-            states = replace(hybrid, **known).iterate(load)
+            hybrid = replace(hybrid, is_over=newton_is_over, evaluation=nearest.evaluation)
+            states = hybrid.iterate(load)
         clock = time.perf_counter()
         for state in states:
             if int(state.iterations):

@@ -26,6 +26,7 @@ from dpl.fem.symmetry import SymmetryGroup
 VALUES = Typed(float64, 1, "A", readonly=True)
 TABLE = Typed(float64, 2, "C", readonly=True)
 INDICES = Typed(int64, 2, "C", readonly=True)
+PARTS = float32[:, ::1], float64[:, ::1]
 
 
 class OrbitArrays(NamedTuple):
@@ -37,52 +38,33 @@ class OrbitArrays(NamedTuple):
     scales: Array  # the same times the weights of the orbits, (M, m)
 
 
-@njit(
-    [float64(TABLE, INDICES, TABLE, VALUES, TABLE, kind[:, ::1]) for kind in (float32, float64)],
-    nogil=True,
-    cache=True,
-)
+@njit([float64(TABLE, INDICES, TABLE, VALUES, TABLE, parts) for parts in PARTS], cache=True)
 def split_field(characters, dofs, scales, field, support, parts):  # type: ignore[no-untyped-def]
     """Set parts (M, m) by parity of a field (n,) minus `support` (M, m), over a unit; return it.
 
     The unit is the largest entry, so that parts in float32 neither underflow nor overflow.
     """
-    M, m = dofs.shape
-    whole, own = -support, np.empty(m)
-    for g in range(M):
-        for j in range(m):
+    whole, own = -support, np.empty(dofs.shape[1])
+    for g in range(len(dofs)):
+        for j in range(len(own)):
             own[j] = scales[g, j] * field[dofs[g, j]]
-        for p in range(M):
-            for j in range(m):
-                whole[p, j] += characters[p, g] * own[j]
+        for p in range(len(dofs)):
+            whole[p] += characters[p, g] * own
     largest = np.abs(whole).max()
     unit = largest if largest > 0 else 1.0
-    for p in range(M):
-        for j in range(m):
-            parts[p, j] = whole[p, j] / unit
+    parts[:] = whole / unit
     return unit
 
 
-@njit(
-    [
-        void(TABLE, INDICES, TABLE, kind[:, ::1], float64, float64[::1])
-        for kind in (float32, float64)
-    ],
-    fastmath=True,
-    nogil=True,
-    cache=True,
-)
+@njit([void(TABLE, INDICES, TABLE, parts, float64, float64[::1]) for parts in PARTS], cache=True)
 def join_field(characters, dofs, signs, parts, unit, field):  # type: ignore[no-untyped-def]
     """Set a field (n,) at the degrees of freedom `dofs` from its parts over a unit (M, m)."""
-    M, m = dofs.shape
-    own = np.empty(m)
-    for g in range(M):
+    own = np.empty(dofs.shape[1])
+    for g in range(len(dofs)):
         own[:] = 0.0
-        for p in range(M):
-            factor = unit * characters[p, g]
-            for j in range(m):
-                own[j] += factor * parts[p, j]
-        for j in range(m):
+        for p in range(len(dofs)):
+            own += (unit * characters[p, g]) * parts[p]
+        for j in range(len(own)):
             field[dofs[g, j]] = signs[g, j] * own[j]
 
 
@@ -104,9 +86,8 @@ class OrbitForm(NamedTuple):
     def arrays(self, numbers: NDArray[np.int64]) -> OrbitArrays:
         """Return the arrays of compiled loops; `numbers` (n,) of the free degrees of freedom."""
         images, signs, weights = (part.numpy() for part in self.orbits)
-        return OrbitArrays(
-            self.parities.characters.numpy(), numbers[images], signs, signs * weights
-        )
+        characters = self.parities.characters.numpy()
+        return OrbitArrays(characters, numbers[images], signs, signs * weights)
 
     def parts(self, force: Tensor) -> Tensor:
         """Return the products of a force at free degrees of freedom, (n,), with fields, (M, m)."""
