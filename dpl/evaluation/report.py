@@ -191,6 +191,7 @@ class _Simulated:
         count = torch.zeros_like(answer.iterations)
         yield Solution(
             displacement=answer.displacement / scene.length,
+            internal=torch.full_like(answer.displacement, math.nan),  # no part of an answer
             residual=answer.residual,
             volume_ratio=answer.volume_ratio,
             status=torch.where(met, int(Status.CONVERGED), int(Status.NOT_CONVERGED)),

@@ -109,11 +109,11 @@ class HeldBody:
         of its last correction, see `corrected`.
         """
         patch, state, u = self.patch, candidate.state, candidate.state.displacement
-        evaluation, force = self.newton.problem.evaluate(u), candidate.force
+        force = candidate.force
         if force is None:
-            force = patch.of_field(evaluation.internal[0] - self.load.force[0])
+            force = patch.of_field(state.internal[0] - self.load.force[0])
         missed = float(patch.at(self.goal - patch.of_field(u[0])).norm(dim=1).max())
-        candidate = candidate._replace(force=force, motion_error=missed, evaluation=evaluation)
+        candidate = candidate._replace(force=force, motion_error=missed)
         if request.warm and candidate.known_error < CORRECTED_WARM:
             return candidate
         if request.over("errors"):
@@ -121,7 +121,7 @@ class HeldBody:
         products = 0 if candidate.known_error < CORRECTED_WARM else PRODUCTS
         with request.durations.timed("errors"):
             found = estimate_error(
-                self.newton.linear_solver, self.load, u, evaluation, products=products
+                self.newton.linear_solver, self.load, u, state.evaluation, products=products
             )
         largest = max(float(u.norm(dim=2).max()), 1e-300)
         return candidate._replace(
@@ -141,8 +141,7 @@ class HeldBody:
         if not candidate.known_error < math.inf:
             unknown = torch.full((len(patch.parts),), math.inf, dtype=torch.float64)
             return unknown, unknown
-        evaluation = candidate.evaluation or self.newton.problem.evaluate(u[None])
-        balance = evaluation.internal[0] - self.load.force[0]
+        balance = candidate.state.internal[0] - self.load.force[0]
         reaction = patch.of_field(balance)
         if candidate.motion_error:
             reaction = reaction + patch.stiffness_times(self.goal - patch.of_field(u))

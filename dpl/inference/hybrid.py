@@ -15,6 +15,7 @@ from dpl.fem import (
     SubspaceNewton,
     evaluate_solution,
 )
+from dpl.fem.problem import Evaluation
 from dpl.fem.solvers.solution import check_tol, run_lockstep
 from dpl.scene import Scene
 
@@ -89,6 +90,8 @@ class Hybrid:
         rule: Criterion by which Newton continues from the prediction, one of `RULES`.
         steps: Iterations without tangents that precede Newton; None: no such iterations.
         is_over: Called between these iterations and Newton; True: the iteration ends.
+        evaluation: Internal force and min det F at the prediction of one load, if known; needed by
+            `steps`.
     """
 
     predict: Predict
@@ -96,6 +99,7 @@ class Hybrid:
     rule: str = "natural_monotonicity"
     steps: AndersonSolver | None = None
     is_over: Callable[[], bool] = bool  # which returns False
+    evaluation: Evaluation | None = None
 
     def __post_init__(self) -> None:
         if self.rule not in RULES:
@@ -138,7 +142,7 @@ class Hybrid:
             yield from self._corrected(load, guess)
             return
         least = None
-        for state in self.steps.iterate(load, guess=guess):
+        for state in self.steps.iterate(load, guess=guess, evaluation=self.evaluation):
             if not state.volume_ratio > 0:
                 break
             yield state

@@ -11,7 +11,6 @@ from typing import NamedTuple, TypeVar
 from torch import Tensor
 
 from dpl.fem import Solution
-from dpl.fem.problem import Evaluation
 from dpl.fem.solvers.error_estimate import PRODUCTS
 from dpl.fem.solvers.solution import check_tol
 from dpl.inference.arguments import as_number
@@ -42,7 +41,6 @@ class Candidate(NamedTuple):
     error_in_modes: float = 0.0  # relative correction in the modes of the model [-]; 0 without
     error_outside: float = math.inf  # relative error outside of the modes [-]; infinite: unknown
     correction: Tensor | None = None  # behind the estimated error, (1, N, D) [-]
-    evaluation: Evaluation | None = None  # internal force and min det F, if known
     motion_error: float = 0.0  # largest distance of a held node from its prescribed place [-]
     force: Tensor | None = None  # of a gripper, (m,) [-]; None: balances the stresses
     forces_found: bool = False  # as of `GraspAnswer`

@@ -226,7 +226,7 @@ class Simulator:
         state = candidate.state
         with request.durations.timed("estimate"):
             found = estimate_error(
-                self.scene.linear, load, state.displacement, candidate.evaluation,
+                self.scene.linear, load, state.displacement, state.evaluation,
                 products=request.products,
             )  # fmt: skip
         if found.is_indefinite:
@@ -254,8 +254,8 @@ class Simulator:
             # a rough estimate suffices up to `FAR`
             rough = Request(error=FAR, products=0 if self.scene.is_compact else MANY_PRODUCTS)
             distances = [self._with_error(load, one, rough).known_error for one in starts]
-        nearest = starts[distances.index(min(distances))]
-        start = nearest.state.displacement if min(distances) <= FAR else None
+        nearest = starts[distances.index(min(distances))].state
+        start = nearest.displacement if min(distances) <= FAR else None
         stage = "Newton" if start is None or not self.scene.is_compact else "iteration"
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
             linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
@@ -269,10 +269,12 @@ class Simulator:
             return request.over(stage)
 
         tol = request.iteration_tol(self.scene)
-        states = replace(self.scene.corrector, tol=tol).iterate(load)
-        if start is not None:
+        if start is None:
+            states = replace(self.scene.corrector, tol=tol).iterate(load)
+        else:
             hybrid = default_hybrid(lambda load: start, self.scene, tol)
-            states = replace(hybrid, is_over=newton_is_over).iterate(load)
+            hybrid = replace(hybrid, is_over=newton_is_over, evaluation=nearest.evaluation)
+            states = hybrid.iterate(load)
         clock = time.perf_counter()
         for state in states:
             if int(state.iterations):
@@ -326,7 +328,7 @@ class Simulator:
         wanted = ERROR if request.error is None else request.error
         begin = time.perf_counter()
         *_, state = self.newton.states(
-            load, guess=guess.displacement, evaluation=first.evaluation, error_tol=wanted,
+            load, guess=guess.displacement, evaluation=first.state.evaluation, error_tol=wanted,
             max_iter=self.steps - taken, is_over=lambda: request.over("step"),
         )  # fmt: skip
         request.durations.add("step", (time.perf_counter() - begin) / (1 + state.iterations))
@@ -345,12 +347,10 @@ class Simulator:
         iterations: int = 0,
         evaluation: Evaluation | None = None,
     ) -> Candidate:
-        """Return a displacement as a solution, with its evaluation if that is not known."""
-        problem, tol = self.scene.problem, request.iteration_tol(self.scene)
-        if evaluation is None:
-            evaluation = problem.with_parameters(load.parameters).evaluate(displacement)
+        """Return a displacement as a solution; it is evaluated unless the evaluation is given."""
         state = evaluate_solution(
-            problem, displacement, load, tol, iterations=iterations,
-            from_guess=method in ("prediction", "corrected"), evaluation=evaluation,
+            self.scene.problem, displacement, load, request.iteration_tol(self.scene),
+            iterations=iterations, from_guess=method in ("prediction", "corrected"),
+            evaluation=evaluation,
         )  # fmt: skip
-        return Candidate(method, state, evaluation=evaluation)
+        return Candidate(method, state)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from dpl.fem.linear.condensation import (
 )
 from dpl.fem.linear.krylov import conjugate_gradients, conjugate_gradients_of_tensors
 from dpl.fem.materials.material import Material
-from dpl.fem.solvers.parity_factor import OrbitForm, TermMatrices
+from dpl.fem.solvers.parity_factor import OrbitArrays, OrbitForm, TermMatrices, split_field
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import SymmetryGroup
 from dpl.models.interface import full_precision
@@ -36,15 +36,6 @@ Solve = Callable[[Array], tuple[float, Parts, Parts]]  # see `LinearResponse.at`
 MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are float32 [-]
 FEW = 8  # loads that compiled loops solve faster than products of matrices do
 MAX_VALUES = 2**26  # of a batch that are computed at a time by tensor operations
-
-
-class OrbitArrays(NamedTuple):
-    """Degrees of freedom by parity p and symmetry g, see `dpl.fem.parity`."""
-
-    characters: Array  # factor of parity p under symmetry g, (M, M)
-    dofs: NDArray[np.int64]  # images of one degree of freedom of each of m orbits, (M, m)
-    signs: Array  # factors of these images, (M, m)
-    scales: Array  # the same times the weights of the orbits, (M, m)
 
 
 class LinearResponse:
@@ -132,29 +123,23 @@ class LinearResponse:
     @cached_property
     def orbits(self) -> OrbitArrays:
         """Degrees of freedom of the orbits for compiled loops."""
-        parities, orbits, _ = self.form
-        dofs = self.scene.problem.free.flatten().nonzero()[:, 0].numpy()
-        signs = orbits.sign.numpy()
-        scales = signs * orbits.weight.numpy()
-        return OrbitArrays(parities.characters.numpy(), dofs[orbits.images.numpy()], signs, scales)
+        return self.form.arrays(self.scene.problem.free.flatten().nonzero()[:, 0].numpy())
 
     def at(self, law: Material) -> Solve:
         """Return the function from forces f (N, D) to linear solutions.
 
         It returns a unit and, over this unit and by parity, f - s and K(0)^-1 (f - s), (M, m).
 
-        The law has no ranges. The unit is the largest entry, so that parts in float32 neither
-        underflow nor overflow.
+        The law has no ranges. For the unit see `split_field`.
         """
         factors = np.append(self.terms.factors(law)[0].numpy(), 1.0)
-        inverse, orbits = self._inverse(factors), self.orbits
-        support = (factors @ self._supports.numpy()).reshape(orbits.dofs.shape)
+        inverse, (characters, dofs, _, scales) = self._inverse(factors), self.orbits
+        support = (factors @ self._supports.numpy()).reshape(dofs.shape)
+        dtype = self.blocks.values.dtype
 
         def solve(force: Array) -> tuple[float, Parts, Parts]:
-            whole = orbits.characters @ (orbits.scales * force.ravel()[orbits.dofs]) - support
-            largest = float(np.abs(whole).max())
-            unit = largest if largest > 0 else 1.0
-            parts = (whole / unit).astype(self.blocks.values.dtype)
+            parts = np.empty(dofs.shape, dtype)
+            unit = split_field(characters, dofs, scales, force.ravel(), support, parts)
             return unit, parts, inverse(parts)
 
         return solve

@@ -16,6 +16,7 @@ KERNELS = {"avx512dq": "SkylakeX", "avx2": "Haswell"}
 CPUINFO = Path("/proc/cpuinfo")
 # kernels that OpenBLAS selects for CPUs that it does not know
 OLD_KERNELS = {"generic", "prescott", "core2", "penryn", "dunnington", "atom", "nehalem"}
+FEWEST = 16  # items for which a thread starts; on a busy machine its start takes milliseconds
 S = TypeVar("S")
 T = TypeVar("T")
 
@@ -66,10 +67,10 @@ def one_thread() -> AbstractContextManager[None]:
 def on_threads(call: Callable[[S], T], items: Sequence[S]) -> list[T]:
     """Return the results of a call for each item, on as many threads as torch uses.
 
-    The threads run in parallel only where the call releases the interpreter lock, as compiled loops
-    with `nogil` do.
+    Each thread has `FEWEST` items or more. The threads run in parallel only where the call releases
+    the interpreter lock, as compiled loops with `nogil` do.
     """
-    count = min(torch.get_num_threads(), len(items))
+    count = min(torch.get_num_threads(), len(items) // FEWEST)
     if count < 2:
         return [call(item) for item in items]
     with ThreadPoolExecutor(count) as pool:

@@ -99,3 +99,13 @@ def test_convergence_is_slower_without_memory(usual):
     )
     assert long.converged.all()
     assert int(long.iterations) <= int(short.iterations)
+
+
+def test_every_state_has_its_own_internal_force_and_that_of_the_guess_may_be_given(usual):
+    newton, load, exact = usual
+    guess, solver = 1.003 * exact, fem.AndersonSolver(newton)
+    known = newton.problem.evaluate(guess)
+    states = solver.iterate(load, guess=guess), solver.iterate(load, guess=guess, evaluation=known)
+    for one, other in zip(*states, strict=True):
+        assert torch.equal(one.internal, newton.problem.evaluate(one.displacement).internal)
+        assert torch.equal(one.displacement, other.displacement)

@@ -242,6 +242,7 @@ class Scripted:
             good = int(Status.CONVERGED if ended else Status.NOT_CONVERGED)
             yield Solution(
                 displacement=u,
+                internal=u,
                 residual=torch.ones(1),
                 volume_ratio=torch.ones(1),
                 status=torch.tensor([good]),
@@ -321,7 +322,7 @@ class Steps:
     def __init__(self, *steps, ends=False):
         self.steps, self.ends = steps, ends
 
-    def iterate(self, load, *, guess):
+    def iterate(self, load, *, guess, evaluation=None):
         for k, (x, residual, volume) in enumerate(self.steps):
             (state,) = list(Scripted(None, (x,), ends=None).iterate(load, guess=guess))
             ended = self.ends and k == len(self.steps) - 1

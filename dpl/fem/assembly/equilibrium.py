@@ -15,23 +15,30 @@ from collections.abc import Sequence
 from functools import reduce
 
 import torch
+from scipy.linalg.blas import dnrm2
 from torch import Tensor
 
-FAINT = 1e-292  # largest force below which arithmetic rounds to an absolute precision [-]
+FAINT = 1e-292  # force below which arithmetic rounds to an absolute precision [-]
 
 
 def relative_norm(residual: Tensor, loads: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Return ||R|| over the largest of the norms of loads, and that norm, (B,) each [-].
 
-    R is (B, N, D), and the loads are (B or 1, N, D) [-]. Norms are taken of multiples of the
-    largest force, so that no square underflows or overflows. Without loads the result is ||R||. It
-    is NaN for a load that is not finite, and for one whose largest entry is below `FAINT`, since
-    its residual cannot be computed.
+    R is (B, N, D), and the loads are (B or 1, N, D) [-]. Without loads the result is ||R||. It is
+    NaN for a load that is not finite, and for one whose norm is below `FAINT`, since its residual
+    cannot be computed.
     """
-    residual, loads = residual.flatten(1), [load.flatten(1) for load in loads]
-    unit = reduce(torch.maximum, [load.abs().amax(1) for load in loads])  # NaN if an entry is
-    unit = torch.where(unit == 0, 1.0, unit)
-    unit = torch.where((unit >= FAINT) & (unit < torch.inf), unit, torch.nan)
-    size = reduce(torch.maximum, [(load / unit[:, None]).norm(dim=1) for load in loads])
+    size = reduce(torch.maximum, map(norms, loads))  # NaN if an entry is
     size = torch.where(size == 0, 1.0, size)
-    return (residual / unit[:, None]).norm(dim=1) / size, size * unit
+    size = torch.where((size >= FAINT) & (size < torch.inf), size, torch.nan)
+    return norms(residual) / size, size
+
+
+def norms(fields: Tensor) -> Tensor:
+    """Return norms (B,) of fields (B, N, D) in float64 without under- or overflow of squares."""
+    rows = fields.detach().flatten(1)
+    if rows.device.type == "cpu":
+        return torch.tensor([dnrm2(row) for row in rows.numpy()], dtype=torch.float64)
+    unit = rows.abs().amax(dim=1)
+    unit = torch.where(unit > 0, unit, 1.0)
+    return unit * (rows / unit[:, None]).norm(dim=1)

@@ -1,15 +1,46 @@
 """Least-squares fit of a force by a few fixed forces, by which families recognise their loads."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
+from numba import float64, njit
+from numba.types import Array as Typed
 from numpy.typing import NDArray
 from torch import Tensor
 
 Array = NDArray[np.float64]
+SHAPES, FORCE = (Typed(float64, dim, "C", readonly=True) for dim in (3, 2))
 LEAST_SQUARE = 1e-13  # singular value of the normal equations over the largest that counts [-]
 EDGE = 1e-6  # of the largest size: a size that much below its range lies in it, due to rounding [-]
 FITS = 1e-6  # distance from a family up to which a force belongs to it [-]
+
+
+@njit([float64(SHAPES, FORCE, float64, float64[::1], float64[:, ::1], float64[::1])], cache=True)
+def _add_normal_equations(shapes, force, unit, q, matrix, right):  # type: ignore[no-untyped-def]
+    """Add the products of shapes (N, D, K) to `matrix`, unless empty, and with the rest to `right`.
+
+    The rest is a force (N, D) over a unit minus the sum of q (K,) times shapes, at the nodes on
+    which the force acts. Returns the square of its norm.
+    """
+    square = 0.0
+    for n in range(len(force)):
+        is_loaded = False
+        for i in range(force.shape[1]):
+            is_loaded = is_loaded or force[n, i] != 0
+        if not is_loaded:
+            continue
+        for i in range(force.shape[1]):
+            rest = force[n, i] / unit
+            for k in range(len(q)):
+                rest -= q[k] * shapes[n, i, k]
+            square += rest * rest
+            for k in range(len(q)):
+                right[k] += rest * shapes[n, i, k]
+            for k in range(len(matrix)):
+                for m in range(k + 1):
+                    matrix[k, m] += shapes[n, i, k] * shapes[n, i, m]
+    return square
 
 
 def fit(
@@ -24,15 +55,14 @@ def fit(
     unit, count = float(np.abs(force).max(initial=0.0)), shapes.shape[-1]
     if unit == 0:
         return np.zeros(count), 0.0
-    loaded = np.flatnonzero(force.any(axis=1))
-    matrix, rest = shapes[loaded].reshape(-1, count), force[loaded].ravel() / unit
-    sizes, axes = np.linalg.eigh(matrix.T @ matrix)
+    q, (matrix, right) = np.zeros(count), (np.zeros((count, count)), np.zeros(count))
+    whole = _add_normal_equations(shapes, force, unit, q, matrix, right)
+    sizes, axes = np.linalg.eigh(matrix)  # which reads the lower triangle
     inverse = np.where(sizes > LEAST_SQUARE * sizes[-1], 1 / np.maximum(sizes, 1e-300), 0.0)
-    q, whole = np.zeros(count), np.linalg.norm(rest)
     for _ in range(2):  # the second time removes the rounding error of the normal equations
-        step = axes @ (inverse * (rest @ matrix @ axes))
-        q, rest = q + step, rest - matrix @ step
-    q, residual = unit * q, float(np.linalg.norm(rest) / whole)
+        q, right = q + axes @ (inverse * (right @ axes)), np.zeros(count)
+        square = _add_normal_equations(shapes, force, unit, q, matrix[:0], right)
+    q, residual = unit * q, math.sqrt(square / whole)
     if inverse.all() or low <= q.min() <= q.max() <= high:
         return q, residual
     from scipy.optimize import lsq_linear  # its import is not needed for independent shapes

@@ -1,7 +1,6 @@
 """Anderson acceleration of a fixed-point iteration with the corotated inverse of K(0)."""
 
 import time
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -9,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.linear.interface import Array
+from dpl.fem.problem import Evaluation
 from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load, Solution, evaluate_solution, run_lockstep
@@ -39,22 +38,33 @@ class AndersonSolver:
     memory: int = 12
     max_iter: int = 30
 
-    def iterate(self, load: Load, *, guess: Tensor) -> Iterator[Solution]:
-        """Yield the guess (B, N, D) [-] and the state after each iteration; loads in lockstep."""
-        pairs = zip(load.unbatch(), guess.split(1), strict=True)
-        yield from run_lockstep([self._member(single, u) for single, u in pairs])
+    def iterate(
+        self, load: Load, *, guess: Tensor, evaluation: Evaluation | None = None
+    ) -> Iterator[Solution]:
+        """Yield the guess and the state after each iteration; loads in lockstep.
 
-    def _member(self, load: Load, guess: Tensor) -> Iterator[Solution]:
+        Args:
+            load, guess: The load, and the displacement to start from, (B, N, D) [-].
+            evaluation: Internal force and min det F at the guess of one load, if known. The guess
+                must then have the displacement of the supports.
+        """
+        pairs = zip(load.unbatch(), guess.split(1), strict=True)
+        yield from run_lockstep([self._member(single, u, evaluation) for single, u in pairs])
+
+    def _member(
+        self, load: Load, guess: Tensor, evaluation: Evaluation | None
+    ) -> Iterator[Solution]:
         """Yield the states under one load."""
         start, newton = time.perf_counter(), self.newton.with_parameters(load.parameters)
         problem = newton.problem
-        u = torch.where(problem.free, guess, problem.prescribed)
+        u = guess if evaluation else torch.where(problem.free, guess, problem.prescribed)
         factor: CorotatedFactor | None = None
         residuals: list[float] = []
         right = step = np.zeros(len(problem.discretisation.free_numbers))
-        steps, changes = (deque[Array](maxlen=self.memory) for _ in range(2))
+        S, C = np.empty((2, self.memory, len(right)))  # steps, changes of the residual
+        products = np.empty((self.memory, self.memory))  # C C^T
         for count in range(self.max_iter + 1):
-            evaluation = problem.evaluate(u)
+            evaluation = evaluation or problem.evaluate(u)
             seconds = time.perf_counter() - start
             state = evaluate_solution(
                 self.newton.problem, u, load, newton.tol,
@@ -71,9 +81,9 @@ class AndersonSolver:
                 factor = newton.linear_solver.corotational.at(u)
                 step = factor.apply(right)
             else:  # from the combination of iterates with the smallest residual
-                steps.append(step)
-                changes.append(right - before)
-                S, C = np.stack(steps), np.stack(changes)
-                weights = np.linalg.lstsq(C @ C.T, C @ right, rcond=1e-13)[0]
-                step = factor.apply(right - weights @ C) - weights @ S
-            u = u + problem.extend(step)[None]
+                k, used = (count - 1) % self.memory, slice(min(count, self.memory))
+                S[k], C[k] = step, right - before
+                products[k, used] = products[used, k] = C[used] @ C[k]
+                weights = np.linalg.lstsq(products[used, used], C[used] @ right, rcond=1e-13)[0]
+                step = factor.apply(right - weights @ C[used]) - weights @ S[used]
+            u, evaluation = u + problem.extend(step)[None], None

@@ -255,6 +255,7 @@ class Newton:
         factor = 1.0 if balanced else run.steps.factor
         return Solution(
             displacement=state.displacement,
+            internal=state.internal,
             residual=torch.tensor([residual], dtype=force.dtype),
             volume_ratio=state.volume_ratio,
             status=torch.tensor([int(Status.NOT_CONVERGED if end is None else end)]),

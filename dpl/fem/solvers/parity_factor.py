@@ -7,11 +7,12 @@ fewer.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
 import torch
+from numba import float32, float64, int64, njit, void
+from numba.types import Array as Typed
 from numpy.typing import NDArray
 from scipy.sparse import block_diag, coo_array, csr_array, dia_array
 from torch import Tensor
@@ -22,6 +23,50 @@ from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import SymmetryGroup
+
+VALUES = Typed(float64, 1, "A", readonly=True)
+TABLE = Typed(float64, 2, "C", readonly=True)
+INDICES = Typed(int64, 2, "C", readonly=True)
+PARTS = float32[:, ::1], float64[:, ::1]
+
+
+class OrbitArrays(NamedTuple):
+    """Degrees of freedom by parity p and symmetry g, see `dpl.fem.parity`."""
+
+    characters: Array  # factor of parity p under symmetry g, (M, M)
+    dofs: NDArray[np.int64]  # images of one degree of freedom of each of m orbits, (M, m)
+    signs: Array  # factors of these images, (M, m)
+    scales: Array  # the same times the weights of the orbits, (M, m)
+
+
+@njit([float64(TABLE, INDICES, TABLE, VALUES, TABLE, parts) for parts in PARTS], cache=True)
+def split_field(characters, dofs, scales, field, support, parts):  # type: ignore[no-untyped-def]
+    """Set parts (M, m) by parity of a field (n,) minus `support` (M, m), over a unit; return it.
+
+    The unit is the largest entry, so that parts in float32 neither underflow nor overflow.
+    """
+    whole, own = -support, np.empty(dofs.shape[1])
+    for g in range(len(dofs)):
+        for j in range(len(own)):
+            own[j] = scales[g, j] * field[dofs[g, j]]
+        for p in range(len(dofs)):
+            whole[p] += characters[p, g] * own
+    largest = np.abs(whole).max()
+    unit = largest if largest > 0 else 1.0
+    parts[:] = whole / unit
+    return unit
+
+
+@njit([void(TABLE, INDICES, TABLE, parts, float64, float64[::1]) for parts in PARTS], cache=True)
+def join_field(characters, dofs, signs, parts, unit, field):  # type: ignore[no-untyped-def]
+    """Set a field (n,) at the degrees of freedom `dofs` from its parts over a unit (M, m)."""
+    own = np.empty(dofs.shape[1])
+    for g in range(len(dofs)):
+        own[:] = 0.0
+        for p in range(len(dofs)):
+            own += (unit * characters[p, g]) * parts[p]
+        for j in range(len(own)):
+            field[dofs[g, j]] = signs[g, j] * own[j]
 
 
 class OrbitForm(NamedTuple):
@@ -38,6 +83,12 @@ class OrbitForm(NamedTuple):
         orbits = SignedOrbits.of_field(parities, group, problem.free)
         node = problem.free.nonzero()[orbits.images[0], 0]
         return cls(parities, orbits, problem.points[node].numpy())
+
+    def arrays(self, numbers: NDArray[np.int64]) -> OrbitArrays:
+        """Return the arrays of compiled loops; `numbers` (n,) of the free degrees of freedom."""
+        images, signs, weights = (part.numpy() for part in self.orbits)
+        characters = self.parities.characters.numpy()
+        return OrbitArrays(characters, numbers[images], signs, signs * weights)
 
     def parts(self, force: Tensor) -> Tensor:
         """Return the products of a force at free degrees of freedom, (n,), with fields, (M, m)."""
@@ -67,8 +118,7 @@ class ParityFactor(Factor):
     """Nested condensation of K(0) for one value of each of m orbits, M parities."""
 
     blocks: Condensed  # blocks of the parities in float32
-    orbits: SignedOrbits  # degrees of freedom of each orbit
-    characters: Tensor  # factor of each parity under each symmetry, (M, M)
+    orbits: OrbitArrays  # free degrees of freedom of each orbit
     negative_pivots: int = 0
 
     @classmethod
@@ -77,36 +127,28 @@ class ParityFactor(Factor):
         form = OrbitForm.of(problem, group)
         exact = condense(form.matrices(problem), form.points)
         blocks = exact._replace(values=exact.values.astype(np.float32))
-        return cls(blocks, form.orbits, form.parities.characters)
+        return cls(blocks, form.arrays(np.arange(problem.pattern.size)))
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right, in the accuracy of float32."""
-        images, signs, scales, characters = self._arrays
-        parts = characters @ (scales * right[images])
-        solved = np.empty_like(parts)
+        characters, dofs, signs, scales = self.orbits
+        (parts, solved), x = np.empty((2, *dofs.shape), np.float32), np.empty_like(right)
+        unit = split_field(characters, dofs, scales, right, np.zeros(dofs.shape), parts)
         table, unknowns, _, values = self.blocks
         condensed_solves(table, unknowns, values, parts, solved)
-        x = np.empty_like(right)
-        x[images] = signs * (characters.T @ solved)
+        join_field(characters, dofs, signs, solved, unit, x)
         return x
 
     def compliance_steps(
         self, places: NDArray[np.int64], out: Array, size: int, rtol: float
     ) -> Iterator[None]:
         """Set the entries of K^-1 at some places, see `Factor.compliance_steps`."""
-        images, _, scales, characters = self._arrays
-        order = np.argsort(images, axis=None)
-        found = order[np.searchsorted(images.ravel()[order], places)]
-        orbit = found % images.shape[1]  # of the values at the places
-        own = np.where(images[:, orbit] == places, scales[:, orbit], 0.0)  # (M, k)
-        shares = characters @ own
-        return add_inverses(self.blocks, orbit, shares, out)
-
-    @cached_property
-    def _arrays(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
-        """Images and signs of the orbits, signs times weights, (M, m), and the characters."""
-        images, signs, weights = (part.numpy() for part in self.orbits)
-        return images, signs, signs * weights, self.characters.numpy()
+        characters, dofs, _, scales = self.orbits
+        order = np.argsort(dofs, axis=None)
+        found = order[np.searchsorted(dofs.ravel()[order], places)]
+        orbit = found % dofs.shape[1]  # of the values at the places
+        own = np.where(dofs[:, orbit] == places, scales[:, orbit], 0.0)  # (M, k)
+        return add_inverses(self.blocks, orbit, characters @ own, out)
 
 
 class TermMatrices(NamedTuple):

@@ -68,6 +68,7 @@ class Solution(NamedTuple):
 
     Attributes:
         displacement: Over L, (B, N, D) [-].
+        internal: Internal force at `displacement`, (B, N, D) [-].
         residual: ||R_free|| / ||f|| at `displacement` under the whole load, (B,) [-], see
             `Problem.relative_residual_of`.
         volume_ratio: min det F at `displacement`, (B,) [-].
@@ -82,6 +83,7 @@ class Solution(NamedTuple):
     """
 
     displacement: Tensor
+    internal: Tensor
     residual: Tensor
     volume_ratio: Tensor
     status: Tensor
@@ -91,6 +93,11 @@ class Solution(NamedTuple):
     load_factor: Tensor
     seconds: Tensor
     from_guess: Tensor
+
+    @property
+    def evaluation(self) -> Evaluation:
+        """Internal force and min det F."""
+        return Evaluation(self.internal, self.volume_ratio)
 
     @property
     def converged(self) -> Tensor:
@@ -180,6 +187,7 @@ def evaluate_solution(
     count = torch.full_like(volume, iterations, dtype=torch.int64)
     return Solution(
         displacement=displacement,
+        internal=internal,
         residual=ratio,
         volume_ratio=volume,
         status=torch.where(balanced, int(Status.CONVERGED), int(Status.NOT_CONVERGED)),

@@ -18,14 +18,15 @@ from dpl.fem.assembly.lanes import gather_constants, rows
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.linear import condensation
 from dpl.fem.linear.condensation import add_product, subtract_product
-from dpl.models.linear_response import OrbitArrays
+from dpl.fem.solvers import parity_factor
+from dpl.fem.solvers.parity_factor import OrbitArrays, join_field
 from dpl.models.unrolled import feature_loops
 from dpl.models.unrolled.feature_loops import rotated_strain, unbalanced_stress
 
 SOURCES = (
     element_loops.SOURCES
     + feature_loops.SOURCES
-    + "".join(inspect.getsource(m) for m in (condensation, sys.modules[__name__]))
+    + "".join(inspect.getsource(m) for m in (condensation, parity_factor, sys.modules[__name__]))
 )
 
 
@@ -91,21 +92,6 @@ def join(characters, signs, parts, out):
             factor = characters[p, g]
             for j in range(out.shape[1]):
                 out[g, j] += factor * signs[g, j] * parts[p, j]
-
-
-@njit(fastmath=True)
-def set_field(orbits, values, unit, field):
-    """Set a field (N D,) at free degrees of freedom from values over a unit by parity (M, m)."""
-    M, m = orbits.dofs.shape
-    own = np.empty(m)
-    for g in range(M):
-        own[:] = 0.0
-        for p in range(M):
-            factor = unit * orbits.characters[p, g]
-            for j in range(m):
-                own[j] += factor * values[p, j]
-        for j in range(m):
-            field[orbits.dofs[g, j]] = orbits.signs[g, j] * own[j]
 
 
 @njit
@@ -194,4 +180,5 @@ def predict(law, c, finite, model, inverse, unit, parts, solution, field, sizes)
     linear *= unit
     found = nonlinear_coordinates(law, c, finite, model, linear, sizes)
     add_fields(model.columns, found / unit, model.modes, solution)
-    set_field(model.orbits, solution, unit, field)
+    orbits = model.orbits
+    join_field(orbits.characters, orbits.dofs, orbits.signs, solution, unit, field)
