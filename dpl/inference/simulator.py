@@ -31,6 +31,7 @@ from dpl.training import TrainedSurrogate
 
 ERROR = 1e-3  # estimated relative error in the modes at which the steps end [-]
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
+WORTH = 1 / 3  # known error after steps in the modes over that before, below which they are made [-]
 MAX_RESIDUAL = 1.0  # above it the error outside of the modes is not that of the training [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 
@@ -315,7 +316,8 @@ class Simulator:
     def _in_modes(self, load: Load, guess: Guess, request: Request, *, taken: int = 0) -> Candidate:
         """Return a displacement after Newton's steps in the modes; `taken` steps precede them.
 
-        No step is made where the known error is sufficient, or if none is left.
+        No step is made where the known error is sufficient, unless a prediction is wanted alone and
+        steps are known to reduce its error much, or if none is left.
         """
         method = "corrected" if taken else "prediction"
         first = self._evaluated(method, guess.displacement, load, request, taken)
@@ -323,9 +325,11 @@ class Simulator:
             return first
         in_range = bool((first.state.volume_ratio > 0) & (first.state.residual < MAX_RESIDUAL))
         enough = request.sufficient_error if taken < self.steps else FAR
-        if in_range and guess.error <= enough:
+        pays = guess.error_outside < WORTH * guess.error and not request.is_more_than_prediction
+        if in_range and guess.error <= enough and not pays:
             return first._replace(error=guess.error)
         wanted = ERROR if request.error is None else request.error
+        wanted = guess.error_outside if pays else wanted
         begin = time.perf_counter()
         *_, state = self.newton.states(
             load, guess=guess.displacement, evaluation=first.state.evaluation, error_tol=wanted,
