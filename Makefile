@@ -16,6 +16,9 @@ BIN := .venv/bin
 WORKERS ?= 2
 PIP := $(BIN)/pip install --quiet --no-compile -c constraints.txt  # Python compiles what it imports
 
+# imports of torch take several times as long where their bytecode is not kept
+unexport PYTHONDONTWRITEBYTECODE
+
 FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M)
 DEMO := $(BIN)/python scripts/train.py mesh=finger mesh.size=[0.08,0.02,0.02] mesh.cells=[24,8,8] young=1e6 \
   material.poisson=0.4 loads.deflection=0.2 data.train=128 data.val=16 data.test=8 model.rank=80 model.cells=120 \

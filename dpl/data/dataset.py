@@ -18,7 +18,7 @@ import torch
 from rich import progress
 
 from dpl.data.solving.background import Background
-from dpl.data.solving.solve import Guess, LoadKey, SolvedLoad
+from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.solving.worker_pool import graceful_shutdown, solve_loads
 from dpl.data.storage.integrity import repair, verify
 from dpl.data.storage.store import FORMAT, JOURNAL, STREAMS, Store, bias_warning, blocks
@@ -149,10 +149,7 @@ class DataSet:
         write_file(folder / "scene.json", json.dumps(card, indent=1).encode())
 
     def solve(
-        self,
-        loads: Iterable[tuple[str, Sequence[int]]],
-        stop: object = None,
-        guess: Guess | None = None,
+        self, loads: Iterable[tuple[str, Sequence[int]]], stop: object = None
     ) -> Generator[SolvedLoad, None, None]:
         """Solve loads that have not been tried; yield each as soon as it is solved.
 
@@ -161,7 +158,7 @@ class DataSet:
 
         Args:
             loads: Splits with numbers of loads, in the order of the solves; read when they are due.
-            stop, guess: See `solve_loads`.
+            stop: See `solve_loads`.
 
         Raises:
             DataSetError: The folder holds something else, or another process writes there.
@@ -197,7 +194,7 @@ class DataSet:
 
             workers, timeout = self.workers, self.timeout
             for solved in solve_loads(
-                self.scene, jobs(), workers=workers, timeout=timeout, stop=stop, guess=guess
+                self.scene, jobs(), workers=workers, timeout=timeout, stop=stop
             ):
                 store.write(solved)
                 tried.add(solved.job)
@@ -240,7 +237,6 @@ class LoadSolver:
         dataset: DataSet,
         loads: Iterable[tuple[str, Sequence[int]]],
         *,
-        guess: Guess | None = None,
         stop: object = None,
         thread: bool = False,
     ) -> None:
@@ -254,18 +250,18 @@ class LoadSolver:
         self._done = 0  # loads of this session
         self._news = ""
         self._solved = Background(
-            lambda own: self._solve(loads, own if stop is None else stop, guess), thread=thread
+            lambda own: self._solve(loads, own if stop is None else stop), thread=thread
         )
 
     def _solve(
-        self, loads: Iterable[tuple[str, Sequence[int]]], stop: object, guess: Guess | None
+        self, loads: Iterable[tuple[str, Sequence[int]]], stop: object
     ) -> Generator[LoadKey, None, None]:
         """Yield the keys of solved loads; append a line to the journal at the end."""
         folder, splits = self._dataset.store.folder, list(STREAMS)
         date, start = time.strftime("%Y-%m-%d %H:%M:%S"), time.perf_counter()
         accepted, core_seconds = 0, 0.0
         try:
-            with closing(self._dataset.solve(loads, stop, guess)) as solving:
+            with closing(self._dataset.solve(loads, stop)) as solving:
                 for solved in solving:
                     self._done += 1
                     accepted += solved.accepted

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from dpl.data.datamodule import DataModule
 from dpl.data.dataset import DataSet
-from dpl.data.solving.solve import Guess
 from dpl.data.sources import Stored
 from dpl.fem import Problem
 from dpl.fem.mesh.nodal_fields import read_nodal_fields
@@ -27,7 +26,7 @@ BATCH = 8  # pairs whose residuals are computed together
 class _Read(Stored):
     """Training samples of which nothing has to be solved."""
 
-    def fits(self, dataset: DataSet, guess: Guess | None = None) -> Iterator[dict[str, int]]:
+    def fits(self, dataset: DataSet) -> Iterator[dict[str, int]]:
         yield {"train": self.train, "val": dataset.val, "test": dataset.test}
 
 

@@ -9,15 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dpl.data.dataset import MAX_LOADS, DataSet, LoadSolver
-from dpl.data.solving.solve import Guess
 from dpl.data.storage.store import SHARD_SIZE, Store
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
-from dpl.system.threads import leave_cores, one_thread
+from dpl.system.threads import leave_cores
 
 MAX_COUNT = 10**9  # of batches, and of samples in a batch
 HELD_OUT = 32  # smallest number of held-out loads of a fit, as far as there are as many
-MIN_REST = 128  # training loads that are not solved for which a fit to the first ones saves time
 PATIENCE = 2  # fits without gain after which the growth ends
 MIN_GAIN = 0.95  # ratio of errors from which a fit is one without gain
 # ratio of the training loads of a fit to those of the one before
@@ -69,11 +67,10 @@ class Source:
         """Return the batches of an epoch of gradient descent for a `DataModule`."""
         return data.shuffled()
 
-    def fits(self, dataset: DataSet, guess: Guess | None = None) -> Iterator[dict[str, int]]:
+    def fits(self, dataset: DataSet) -> Iterator[dict[str, int]]:
         """Yield the numbers of loads, by split, of each fit of a model in closed form.
 
-        Missing loads of the data set are solved; `guess` is the prediction of the last fit, from
-        which they are solved.
+        Missing loads of the data set are solved.
         """
         raise ValueError("a model in closed form is fitted to solved loads; set data=offline")
 
@@ -105,21 +102,8 @@ class Stored(Source):
 
     train: int = 1000
 
-    def fits(self, dataset: DataSet, guess: Guess | None = None) -> Iterator[dict[str, int]]:
-        """Yield the sizes of the data set; before, if many loads are missing, those of a first fit.
-
-        The missing loads are then solved from its predictions.
-        """
-        first = fit_sizes(SHARD_SIZE, dataset.val)
-        if len(dataset.store.missing("train", dataset.train)) > MIN_REST:
-            rest = {part: range(first.get(part, 0), n) for part, n in dataset.sizes.items()}
-            loads = [*((part, range(n)) for part, n in first.items()), *rest.items()]
-            self._solver = LoadSolver(dataset, loads, guess=guess, thread=dataset.workers > 0)
-            self._solver.wait(first, show=True)
-            with one_thread():  # the workers need the other cores
-                yield first
-            self._solver.wait(dataset.sizes, show=True)
-            self.close()
+    def fits(self, dataset: DataSet) -> Iterator[dict[str, int]]:
+        """Solve the missing loads; yield the sizes of the data set."""
         dataset.fill()
         yield dataset.sizes
 
@@ -161,7 +145,7 @@ class Growing(Source):
         """Return the number of training loads of the last fit, or of those that are there."""
         return self.points[-1].loads if self.points else len(store.tried("train"))
 
-    def fits(self, dataset: DataSet, guess: Guess | None = None) -> Iterator[dict[str, int]]:
+    def fits(self, dataset: DataSet) -> Iterator[dict[str, int]]:
         """Solve loads in the background; yield the numbers of training and held-out loads of fits.
 
         The errors of each fit have to be recorded before the next one. The loads of validation and
@@ -172,7 +156,7 @@ class Growing(Source):
         leave_cores(dataset.workers)
         self._start = time.monotonic() - (self.points[-1].seconds if self.points else 0.0)
         val, loads, thread = dataset.val, self._loads(dataset), dataset.workers > 0
-        self._solver = solver = LoadSolver(dataset, loads, guess=guess, thread=thread)
+        self._solver = solver = LoadSolver(dataset, loads, thread=thread)
         while not self.is_finished:
             least, most = self._limits()
             solver.wait(fit_sizes(least, val), until=self._deadline(), show=not self.points)

@@ -1,6 +1,5 @@
 """Training of a model in closed form: a fit for each number of loads of its data set."""
 
-import copy
 import math
 import signal
 import sys
@@ -12,10 +11,8 @@ from typing import Any, cast
 
 import lightning as L
 import torch
-from torch import Tensor
 
 from dpl.data.datamodule import DataModule
-from dpl.fem import Load
 from dpl.models.interface import ClosedFormFit
 from dpl.scene import Sample
 from dpl.training import checkpoints
@@ -23,7 +20,6 @@ from dpl.training.callbacks.tensorboard import LogHyperparameters
 from dpl.training.callbacks.throughput import TrainingTime, resident_memory
 from dpl.training.callbacks.worst_cases import WorstCasePlots
 from dpl.training.metrics import ErrorMetrics
-from dpl.training.predictors import Predictor
 from dpl.training.surrogate import Surrogate
 
 # metrics of a learning curve, by their names there
@@ -40,10 +36,8 @@ def fit(
 ) -> float:
     """Fit the network of a surrogate to the training samples, on the CPU.
 
-    `Stored` samples are fitted once, or twice if many loads have to be solved. A source that is
-    `Growing` repeats the fit with more loads. After the first fit loads are solved from its
-    predictions. After each fit its errors on the validation samples are logged, and written with
-    the weights.
+    `Stored` samples are fitted once. A source that is `Growing` repeats the fit with more loads.
+    After each fit its errors on the validation samples are logged, and written with the weights.
 
     Args:
         surrogate: The surrogate; its network is a `ClosedFormFit`.
@@ -67,23 +61,17 @@ def fit(
             if isinstance(one, OBSERVERS):
                 getattr(one, hook)(trainer, surrogate, *more)
 
-    last: Predictor | None = None  # as the last fit has left it
-
-    def guess(load: Load) -> Tensor | None:
-        return None if last is None else cast(Tensor, last(load))
-
     done = [point.e_mean for point in data.source.points]
     best, first, step = min(filter(math.isfinite, done), default=math.inf), len(done), None
     try:
         with _exit_on_sigterm():
-            for step, sizes in enumerate(data.source.fits(data.dataset, guess), first):
+            for step, sizes in enumerate(data.source.fits(data.dataset), first):
                 if step == first:
                     call("setup", "fit")
                     call("on_train_start")
                     call("on_train_epoch_start")
                 data.sizes |= sizes
                 net.fit(data.samples("train"), data.samples("val"))
-                last = _copy_for_solves(surrogate)
                 errors = found = errors_on(surrogate, data.val_dataloader())
                 if (unseen := data.source.unseen(data.store, sizes["train"])) is not None:
                     found = errors_on(surrogate, [unseen])
@@ -107,17 +95,6 @@ def fit(
         for logger in loggers:
             logger.finalize("finished")
     return best
-
-
-def _copy_for_solves(surrogate: Surrogate) -> Predictor | None:
-    """Return a copy from which loads are solved while the model is fitted again.
-
-    None where Newton's method from rest is as fast, or the scene has another solver.
-    """
-    scene = surrogate.scene
-    if scene.newton is not scene.solver or not scene.is_compact:
-        return None
-    return copy.deepcopy(surrogate.predictor, {id(one): one for one in (scene, scene.problem)})
 
 
 def errors_on(surrogate: Surrogate, batches: Iterable[Sample]) -> dict[str, float]:

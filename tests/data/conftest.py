@@ -31,7 +31,7 @@ def solves(monkeypatch):
     """Return a function that lets another one change each solved load of this process."""
 
     def solves(change):
-        def changed(scene, job, guess=None):
+        def changed(scene, job):
             return change(solve_load(scene, job))
 
         monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", changed)

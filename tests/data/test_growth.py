@@ -6,9 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from set_files import content
 
-from dpl.data import DataModule, DataSet, Growing, Stored, dataset, sources
+from dpl.data import DataModule, DataSet, Growing, dataset, sources
 from dpl.data.dataset import LoadSolver
 from dpl.data.storage import store as store_module
 from dpl.system.files import DataSetError, exclusive_lock
@@ -157,32 +156,6 @@ def test_the_errors_of_a_fit_are_those_of_the_loads_that_follow(module):
     assert torch.equal(unseen[0].force, whole[4:8])
     assert torch.equal(unseen[1].force, whole[8:10])
     assert unseen[2] is None, "there is no load after the last one"
-
-
-# ------------------------------------------------------------------ sets of a given size
-
-
-@pytest.mark.parametrize(("there", "fits"), [(0, [4, 16]), (10, [4, 16]), (12, [16])])
-def test_a_model_is_fitted_to_the_first_loads_if_many_are_missing(
-    scene, tmp_path, monkeypatch, there, fits
-):
-    monkeypatch.setattr(sources, "MIN_REST", 5)
-    sizes = {"val": 3, "test": 2, "workers": 0, "folder": str(tmp_path / "d")}
-    DataSet(scene, **sizes | {"train": there}).fill()
-    source, guesses = Stored(16), []
-
-    def guess(load):
-        guesses.append(load)
-
-    found = []
-    for size in source.fits(DataSet(scene, train=16, **sizes), guess):
-        found.append((size["train"], size["val"], len(guesses)))
-    source.close()
-    assert [train for train, *_ in found] == fits
-    assert [val for _, val, _ in found] == [2, 3][-len(fits) :]
-    assert found[-1][2] == (16 - there if len(fits) > 1 else 0)
-    alone = DataSet(scene, train=16, **sizes | {"folder": str(tmp_path / "e")}).fill()
-    assert content(tmp_path / "d") == content(alone.folder)
 
 
 # ------------------------------------------------------------------ in the background

@@ -67,7 +67,7 @@ class Life(RuleBasedStateMachine):
         self.patch = pytest.MonkeyPatch()
         self.patch.setattr("dpl.data.solving.worker_pool.solve_load", self.solve_load)
 
-    def solve_load(self, scene, job, guess=None):
+    def solve_load(self, scene, job):
         self.solved[job] += 1
         if job.number in self.unlucky:
             return failed_load(scene, job, f"{MACHINE_FAILURES[job.number % 2]} 3 times")

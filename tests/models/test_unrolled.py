@@ -15,12 +15,13 @@ from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, recta
 from dpl.fem.parity import Parities
 from dpl.fem.rom.pod import scatter_fields
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness, reduced_terms
+from dpl.fem.solvers.rotation_strain import rotated_strain
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import SymmetryGroup
 from dpl.inference import Simulator
 from dpl.models import Unrolled
 from dpl.models.unrolled.correction import choose_newton, fit_errors
-from dpl.models.unrolled.features import rotated_strain, unbalanced_stress
+from dpl.models.unrolled.features import unbalanced_stress
 from dpl.models.unrolled.fit import modes_of_parity
 from dpl.models.unrolled.regression import RIDGES, MapParities, fit_map
 from dpl.scene import Scene

@@ -1,23 +1,20 @@
 """Drawing and solving a single load."""
 
 import time
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from dpl.fem import AndersonSolver, Load, Solution, Status, solve
+from dpl.fem.solvers.rotation_strain import warped_solution
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 
-# prediction of the displacement (1, N, D) [-] under a load; None: there is none yet
-Guess = Callable[[Load], Tensor | None]
 # Ritz value of the tangent, relative to K(0) in the rotated frames of the nodes, above which an
 # equilibrium counts as stable without a factorisation [-]. It bounds the eigenvalue from above.
 MIN_RITZ_VALUE = 0.1
+WINDOW = 8  # iterations in which the residual has to halve; the first ones may increase it
 
 
 class LoadKey(NamedTuple):
@@ -58,14 +55,12 @@ class SolvedLoad(NamedTuple):
     reason: str
 
 
-def solve_load(scene: Scene, job: LoadKey, guess: NDArray[np.float64] | None = None) -> SolvedLoad:
-    """Draw and solve a load, if possible from a displacement near its solution, (N, D) [-]."""
+def solve_load(scene: Scene, job: LoadKey) -> SolvedLoad:
+    """Draw and solve a load."""
     load, point = _draw(scene, job)
     start = time.perf_counter()
     with one_thread():
-        solution = None if guess is None else _solve_near(scene, load, torch.from_numpy(guess))
-        if solution is None:
-            solution = solve(scene.solver, load)
+        solution = equilibrium(scene, load)
     accepted = bool(solution.stable)
     return SolvedLoad(
         job=job,
@@ -83,24 +78,27 @@ def solve_load(scene: Scene, job: LoadKey, guess: NDArray[np.float64] | None = N
     )
 
 
-def guessed(scene: Scene, job: LoadKey, guess: Guess | None) -> NDArray[np.float64] | None:
-    """Return the prediction for a load, (N, D) [-]; None without one."""
-    if guess is None:
-        return None
-    with torch.no_grad():
-        found = guess(_draw(scene, job)[0])
-    return None if found is None else found[0].numpy()
+def equilibrium(scene: Scene, load: Load) -> Solution:
+    """Return the solution of one load, by the solver of the scene where no faster one succeeds."""
+    solution = _without_tangents(scene, load)
+    return solve(scene.solver, load) if solution is None else solution
 
 
-def _solve_near(scene: Scene, load: Load, guess: Tensor) -> Solution | None:
-    """Return the stable equilibrium near a guess (N, D), found without a factorisation, or None."""
+def _without_tangents(scene: Scene, load: Load) -> Solution | None:
+    """Return the stable equilibrium that Anderson iterations find from `warped_solution`, or None.
+
+    None also on bodies whose tangents are far from K(0) in the rotated frames of the nodes.
+    """
     # The solver of the scene decides on a load whose iteration does not converge and on one whose
     # equilibrium is unstable or nearly so. Data sets therefore hold the loads that it accepts.
     newton = scene.newton
-    *_, solution = AndersonSolver(newton).iterate(load, guess=guess[None])
-    if not solution.converged:
+    if newton is not scene.solver or not scene.is_compact:
         return None
     linear = newton.linear_solver.with_parameters(load.parameters)
+    solver, guess = AndersonSolver(newton, window=WINDOW), warped_solution(linear, load)
+    *_, solution = solver.iterate(load, guess=guess)
+    if not solution.converged:
+        return None
     value = linear.smallest_ritz_value(solution.displacement)
     return solution if value > MIN_RITZ_VALUE else None
 

@@ -22,10 +22,7 @@ from multiprocessing.connection import Connection
 from types import FrameType
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from dpl.data.solving.solve import Guess, LoadKey, SolvedLoad, failed_load, guessed, solve_load
+from dpl.data.solving.solve import LoadKey, SolvedLoad, failed_load, solve_load
 from dpl.scene import Scene
 from dpl.system.processes import block_signals, die_with_parent, spawn_context
 
@@ -78,7 +75,6 @@ def solve_loads(
     workers: int,
     timeout: float | None = None,
     stop: object = None,
-    guess: Guess | None = None,
 ) -> Generator[SolvedLoad, None, None]:
     """Yield solved loads in the order in which they are finished.
 
@@ -88,7 +84,6 @@ def solve_loads(
         workers: Number of processes, one core each; 0: solve in this process, without time limit.
         timeout: Time limit for a load [s]; the first load of a worker has more. None: no limit.
         stop: Once its truth value is True, no further load is started.
-        guess: Called in this process when a solve starts; only for the solver `newton`.
 
     Raises:
         RuntimeError: Workers die repeatedly.
@@ -96,7 +91,7 @@ def solve_loads(
     jobs = iter(jobs)
     if workers == 0:
         while not stop and (job := next(jobs, None)):
-            yield solve_load(scene, job, guessed(scene, job, guess))
+            yield solve_load(scene, job)
         return
     limit = math.inf if timeout is None else timeout
     todo = deque(islice(jobs, max(workers, RETRY_DELAY)))
@@ -106,8 +101,7 @@ def solve_loads(
         while True:
             for worker in pool:
                 if worker.job is None and todo and not stop:
-                    job = todo.popleft()
-                    worker.submit(job, guessed(scene, job, guess), limit)
+                    worker.submit(todo.popleft(), limit)
                     todo.extend(islice(jobs, 1))
             if not any(worker.job for worker in pool):
                 break
@@ -145,12 +139,12 @@ class _Worker:
         self.deadline = math.inf
         self._grace = STARTUP_GRACE
 
-    def submit(self, job: LoadKey, guess: NDArray[np.float64] | None, limit: float) -> None:
-        """Start to solve a load, perhaps from a guess."""
+    def submit(self, job: LoadKey, limit: float) -> None:
+        """Start to solve a load."""
         self.job, self.deadline = job, time.monotonic() + limit + self._grace
         self._grace = 0.0
         with contextlib.suppress(BrokenPipeError):  # `_wait` detects that it died while idle
-            self.pipe.send((job, guess))
+            self.pipe.send(job)
 
     def kill(self) -> None:
         self.process.kill()
@@ -211,4 +205,4 @@ def _work(pipe: Connection, scene: Scene) -> None:
         signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
-            pipe.send(solve_load(scene, *pipe.recv()))
+            pipe.send(solve_load(scene, pipe.recv()))

@@ -13,8 +13,6 @@ from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load, Solution, evaluate_solution, run_lockstep
 
-WINDOW = 5  # iterations in which the residual has to halve
-
 
 @dataclass(frozen=True, eq=False)
 class AndersonSolver:
@@ -22,8 +20,8 @@ class AndersonSolver:
 
     An iteration costs one residual and one solve with the stored factor of K(0). It starts from
     the linear combination of earlier iterates with the smallest residual, which is GMRES on a
-    linear problem. The iteration stops without convergence if the residual does not halve in five
-    iterations or an element inverts; continue with Newton then.
+    linear problem. The iteration stops without convergence if the residual does not halve in
+    `window` iterations or an element inverts; continue with Newton then.
 
     Source: Anderson (1965), J. ACM 12; as a multisecant quasi-Newton method: Fang, Saad (2009),
     Numer. Linear Algebra Appl. 16, equation 24.
@@ -32,11 +30,13 @@ class AndersonSolver:
         newton: Solver whose body, tolerance and factor of K(0) are used.
         memory: Number of earlier iterates that are combined.
         max_iter: Largest number of iterations.
+        window: Number of iterations in which the residual has to halve.
     """
 
     newton: Newton
     memory: int = 12
     max_iter: int = 30
+    window: int = 5
 
     def iterate(
         self, load: Load, *, guess: Tensor, evaluation: Evaluation | None = None
@@ -56,7 +56,7 @@ class AndersonSolver:
     ) -> Iterator[Solution]:
         """Yield the states under one load."""
         start, newton = time.perf_counter(), self.newton.with_parameters(load.parameters)
-        problem = newton.problem
+        problem, window = newton.problem, self.window
         u = guess if evaluation else torch.where(problem.free, guess, problem.prescribed)
         factor: CorotatedFactor | None = None
         residuals: list[float] = []
@@ -72,7 +72,7 @@ class AndersonSolver:
             )  # fmt: skip
             yield state
             residuals.append(float(state.residual))
-            is_slow = count >= WINDOW and not min(residuals[-WINDOW:]) < residuals[-1 - WINDOW] / 2
+            is_slow = count >= window and not min(residuals[-window:]) < residuals[-1 - window] / 2
             diverges = not state.volume_ratio > 0 or not residuals[-1] < 10 * residuals[0]
             if state.converged or diverges or is_slow:
                 return

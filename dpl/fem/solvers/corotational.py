@@ -118,7 +118,8 @@ def _sum_gradients(u, cells, gradients, volumes, out):
                 p += value * gradients[own, a, 0]
                 q += value * gradients[own, a, 1]
                 r += value * gradients[own, a, 2]
-            mean[3 * i : 3 * i + 3] = volumes[own] * p, volumes[own] * q, volumes[own] * r
+            for k, part in enumerate((p, q, r)):  # numba compiles a slice for two seconds
+                mean[3 * i + k] = volumes[own] * part
         for a in range(cells.shape[1]):
             node = cells[e, a]
             for k in range(9):

@@ -14,13 +14,13 @@ from numba import njit
 from dpl.fem.assembly import constitutive_kernels as point
 from dpl.fem.assembly import numba_laws, simd
 from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
-from dpl.fem.solvers import corotational
+from dpl.fem.solvers import corotational, rotation_strain
 from dpl.fem.solvers.corotational import polar_step
+from dpl.fem.solvers.rotation_strain import SERIES_ANGLE
 
 POLAR_ITER = 5  # Newton iterations of a polar decomposition
 MIN_VOLUME_RATIO = 0.05  # det F below which a sample counts as undeformed [-]
-SERIES_ANGLE = 0.3  # rotation angle below which sin(t)/t - 1 is its series [rad]
-MODULES = simd, numba_laws, point, corotational, sys.modules[__name__]
+MODULES = simd, numba_laws, point, corotational, rotation_strain, sys.modules[__name__]
 SOURCES = "".join(inspect.getsource(module) for module in MODULES)
 
 

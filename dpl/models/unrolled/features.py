@@ -13,7 +13,8 @@ from torch.nn.functional import pad
 from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import cofactor, volume_change
 from dpl.fem.problem import Problem
-from dpl.models.unrolled.feature_loops import MIN_VOLUME_RATIO, POLAR_ITER, SERIES_ANGLE
+from dpl.fem.solvers.rotation_strain import rotated_strain
+from dpl.models.unrolled.feature_loops import MIN_VOLUME_RATIO, POLAR_ITER
 
 
 class SampleCells(NamedTuple):
@@ -76,27 +77,6 @@ def mechanical_maps(
     both = torch.stack([-gradients, torch.zeros_like(gradients)], dim=2)
     weighted = (shares[:, None, None] * stress, shares[:, None, None, None] * both)
     return [part.flatten(1).T @ inverse for part in weighted]
-
-
-def rotated_strain(H: Tensor) -> Tensor:
-    """Return exp(W) (I + e) - I - H, (..., 3, 3), with H = e + W, e symmetric and W skew.
-
-    The displacement gradient of the strain e in the frame rotated by W, minus that of the linear
-    theory: of second order in H.
-
-    Source: Huang, Tong, Zhou, Bao, Desbrun (2011), Interactive shape interpolation through
-    controllable dynamic deformation, IEEE TVCG 17 (rotation-strain coordinates).
-    """
-    W, e = (H - H.mT) / 2, (H + H.mT) / 2
-    square = (W * W).sum(dim=(-2, -1), keepdim=True) / 2  # of the angle
-    small = square < SERIES_ANGLE**2
-    angle = torch.where(small, 1.0, square).sqrt()
-    series = -square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
-    first = torch.where(small, series, angle.sin() / angle - 1)  # sin(t)/t - 1
-    cosine = 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90)))
-    second = torch.where(small, cosine, (1 - angle.cos()) / angle**2)
-    beyond = first * W + second * (W @ W)  # exp(W) - I - W
-    return beyond + (W + beyond) @ e
 
 
 def unbalanced_stress(law: Material, H: Tensor, linear: Tensor) -> Tensor:
