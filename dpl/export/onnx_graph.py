@@ -142,4 +142,5 @@ class OnnxSession:
         """Return the outputs of the graph by name, float64, of its inputs."""
         arrays = {name: np.asarray(column, self._dtype) for name, column in inputs.items()}
         found = self._session.run(None, arrays)
-        return {name: np.float64(one) for name, one in zip(self.outputs, found, strict=True)}
+        pairs = zip(self.outputs, found, strict=True)
+        return {name: np.asarray(one, np.float64) for name, one in pairs}

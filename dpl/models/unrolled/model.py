@@ -18,12 +18,12 @@ from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.symmetry import SymmetryGroup
 from dpl.models.interface import StoredBuffers, check_indices
 from dpl.models.linear_base import SCALE_STREAM
-from dpl.models.linear_response import Array, LinearResponse, Solve, largest
+from dpl.models.linear_response import Array, LinearResponse, OrbitArrays, Solve, largest
 from dpl.models.unrolled.compiled import LawArguments, law_arguments, model_arrays
 from dpl.models.unrolled.correction import LOADS, choose_newton, fit_errors, relative_errors
 from dpl.models.unrolled.fit import fit_in_best_modes
 from dpl.models.unrolled.loops import ModelArrays, predict
-from dpl.models.unrolled.products import nonlinear_coordinates
+from dpl.models.unrolled.products import Tensors, nonlinear_coordinates
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.threads import on_threads
@@ -143,7 +143,7 @@ class Unrolled(StoredBuffers):
         for name, (shape, dtype) in self._layout().items():
             self.register_buffer(name, torch.zeros(shape, dtype=dtype))
         self._stiffness = ReducedStiffness(self.stiffness, self.linear.terms)
-        self._kept: dict[torch.device, tuple[ModelArrays, Material, Tensor]] = {}
+        self._kept: dict[torch.device, tuple[Tensors, Material, Tensor]] = {}
         self._last: tuple[Tensor, tuple[LawArguments, Array, Solve]] | None = None
         self.register_buffer("prescribed", problem.prescribed, persistent=False)
 
@@ -218,13 +218,13 @@ class Unrolled(StoredBuffers):
         factors = self.linear.terms.factors(self.scene.problem.material.with_parameters(parameters))
         parts, solved = self.linear.by_parity(force, parameters)  # (B, M, m)
         model, of_samples, places = self._tensors(force.device)
-        unit = largest(parts.flatten(1))  # over which float32 holds the forces, (B, 1)
-        right = model.modes @ (parts / unit[..., None]).permute(1, 2, 0).to(model.modes)
-        right = right.to(parts).flatten(0, 1).index_select(0, places)
-        linear = self._stiffness.solve(factors, unit * right.T)  # Galerkin
+        right = model.modes.to(parts) @ parts.permute(1, 2, 0)
+        right = right.flatten(0, 1).index_select(0, places)
+        linear = self._stiffness.solve(factors, right.T)  # Galerkin
         padded = pad(linear, (0, 1)).T.index_select(0, model.columns.flatten())
         law = of_samples.with_parameters(parameters)
         c, sizes = nonlinear_coordinates(model, law, padded.unflatten(0, model.columns.shape))
+        unit = largest(parts.flatten(1))  # over which float32 holds the displacements, (B, 1)
         added = (model.modes.mT @ (c / unit.T).to(model.modes)).permute(2, 0, 1)
         solved = solved + unit[..., None] * added
         return (self.prescribed + self.linear.fields(solved)).to(force), sizes
@@ -238,7 +238,7 @@ class Unrolled(StoredBuffers):
         for name in ("_doubt", "_arrays"):
             self.__dict__.pop(name, None)
 
-    def _tensors(self, device: torch.device) -> tuple[ModelArrays, Material, Tensor]:
+    def _tensors(self, device: torch.device) -> tuple[Tensors, Material, Tensor]:
         """Return arrays as tensors, the law of their cells, and positions of the modes, (R,)."""
         if device in self._kept:
             return self._kept[device]
@@ -247,11 +247,9 @@ class Unrolled(StoredBuffers):
         def on_device(array: Any) -> Any:
             return torch.from_numpy(array).to(device)
 
-        orbits = arrays.orbits._make(map(on_device, arrays.orbits))
-        model = arrays._make((orbits, *map(on_device, arrays[1:])))
-        model = model._replace(
-            modes=on_device(arrays.modes.astype(self.linear.blocks.values.dtype))
-        )
+        orbits = OrbitArrays(*map(on_device, arrays.orbits))
+        modes = arrays.modes.astype(self.linear.blocks.values.dtype)
+        model = ModelArrays(orbits, *map(on_device, arrays[1:]))._replace(modes=on_device(modes))
         law = self.scene.problem.material.of_cells(self.cells.cpu()[cells]).centred()
         places = on_device(arrays.columns.ravel().argsort()[: self.modes.shape[1]])
         found = model, law, places

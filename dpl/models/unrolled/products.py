@@ -4,6 +4,8 @@ The operations are those of `dpl.models.unrolled.loops` on the same arrays by pa
 the last axis, so that one load is a column of products of matrices.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -11,14 +13,12 @@ from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.material import Material
 from dpl.models.unrolled import features
 from dpl.models.unrolled.fit import limit_step
-from dpl.models.unrolled.loops import ModelArrays
 
+Tensors = Any  # `dpl.models.unrolled.loops.ModelArrays` of tensors
 BOTH = (0, 1)  # axes of coordinates by parity, (M, r, B)
 
 
-def nonlinear_coordinates(
-    model: ModelArrays, law: Material, linear: Tensor
-) -> tuple[Tensor, Tensor]:
+def nonlinear_coordinates(model: Tensors, law: Material, linear: Tensor) -> tuple[Tensor, Tensor]:
     """Return coordinates (M, r, B) of nonlinear displacements, and sizes (B, K + 2).
 
     The sizes are the norms of the linear coordinates and of the correction by each map.
@@ -40,20 +40,23 @@ def nonlinear_coordinates(
     return c, torch.stack(steps).norm(dim=(1, 2)).T
 
 
-def _gradients(model: ModelArrays, c: Tensor) -> Tensor:
+def _gradients(model: Tensors, c: Tensor) -> Tensor:
     """Return H at the sample cells, (B, C, 1, 3, 3), of coordinates (M, r, B)."""
     characters = model.orbits.characters
     parts = model.gradients.mT.to(c) @ c
-    joined = (characters.T @ parts.flatten(1)).view_as(parts)
-    H = model.rest[..., None] + model.entry_signs[..., None] * joined  # (M, b, B)
+    joined: Tensor = characters.T @ parts.flatten(1)
+    images = model.entry_signs[..., None] * joined.view_as(parts)  # (M, b, B)
+    H: Tensor = model.rest[..., None] + images
     blocks = H.unflatten(1, (-1, 9, SIMD_WIDTH))
     return blocks.permute(4, 0, 1, 3, 2).reshape(H.shape[-1], -1, 1, 3, 3)
 
 
-def _coordinates(model: ModelArrays, matrix: Tensor, signs: Tensor, found: Tensor) -> Tensor:
+def _coordinates(model: Tensors, matrix: Tensor, signs: Tensor, found: Tensor) -> Tensor:
     """Return coordinates (M, r, B) of F features (B, C, F, 3, 3) at the sample cells."""
     characters = model.orbits.characters
     shape = found.shape[0], len(signs), -1, SIMD_WIDTH, found[0, 0].numel()
-    blocks = found.reshape(shape)
-    images = signs[..., None] * blocks.permute(1, 2, 4, 3, 0).flatten(1, 3)  # (M, F b, B)
-    return matrix.to(images) @ (characters @ images.flatten(1)).view_as(images)
+    images = signs[..., None] * found.reshape(shape).permute(1, 2, 4, 3, 0).flatten(
+        1, 3
+    )  # (M, F b, B)
+    parts: Tensor = characters @ images.flatten(1)
+    return matrix.to(images) @ parts.view_as(images)
