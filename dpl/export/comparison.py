@@ -91,10 +91,9 @@ def latencies(surrogate: TrainedSurrogate, session: OnnxSession, count: int) -> 
 
 def relative_differences(found: Array, expected: Array) -> Array:
     """Return ||a - b|| / ||b|| of fields (B, ...), (B,) [-]; 0 where both are equal."""
-    difference = np.where(found == expected, 0.0, found - expected)  # both may be infinite
-    difference, size = (
-        np.linalg.norm(x.reshape(len(x), -1), axis=1) for x in (difference, expected)
-    )
     with np.errstate(divide="ignore", invalid="ignore"):
+        difference = np.where(found == expected, 0.0, found - expected)  # both may be infinite
+        both = (x.reshape(len(x), -1) for x in (difference, expected))
+        difference, size = (np.linalg.norm(x, axis=1) for x in both)
         ratio = np.where(difference == 0, 0.0, difference / size)
     return np.where(np.isfinite(ratio), ratio, np.inf)

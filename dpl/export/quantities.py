@@ -15,7 +15,8 @@ from dpl.inference.answer import ROUNDOFF
 from dpl.training import TrainedSurrogate
 
 RIDGE = 1e-10  # of normal equations over their largest diagonal entry [-]
-NUMBERS = ("error", "amplitude", "residual", "min_det_F")  # of each load
+BODY_NUMBERS = ("residual", "min_det_F")  # which need all cells
+NUMBERS = ("error", "amplitude", *BODY_NUMBERS)  # of each load
 
 
 class Quantities(nn.Module):
@@ -28,9 +29,15 @@ class Quantities(nn.Module):
     """
 
     def __init__(self, surrogate: TrainedSurrogate, names: Iterable[str]) -> None:
-        """Take a surrogate and names of numbers."""
+        """Take a surrogate and names of numbers; a residual of a body with ranges is refused."""
         super().__init__()
         self.surrogate, self.names = surrogate, tuple(names)
+        ranges = list(surrogate.scene.loads.parameter_ranges)
+        if ranges and (refused := [name for name in self.names if name in BODY_NUMBERS]):
+            raise ValueError(
+                f"numbers = {', '.join(refused)} must be evaluated without ranges {ranges}; leave "
+                "them out"
+            )
 
     def forward(
         self, force: Tensor, young: Tensor, parameters: Tensor | None = None
@@ -45,8 +52,8 @@ class Quantities(nn.Module):
             u = self.surrogate.predict(load)
         if "amplitude" in names:
             found["amplitude"] = position(scene.loads, load.force)[0]
-        if names & {"residual", "min_det_F"}:
-            body = scene.problem.with_parameters(load.parameters)
+        if names & {*BODY_NUMBERS}:
+            body = scene.problem
             found["residual"] = body.relative_residual_of(body.internal_force(u), load.force)
             found["min_det_F"] = body.volume_ratio(u)
         return scene.length * u, *(found[name] for name in self.names)

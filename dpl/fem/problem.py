@@ -474,8 +474,7 @@ class Problem:
             )
         if not self.parameter_ranges:
             return self
-        tracing = torch.compiler.is_compiling()
-        if tracing or len(parameters) > 1 or parameters.requires_grad:
+        if len(parameters) > 1 or parameters.requires_grad:
             return self._with_values(parameters)
         body: Self = self._body_at(*parameters[0].tolist())
         return body
