@@ -26,7 +26,7 @@ from dpl import Sample, config
 from dpl.commands.cli import command
 from dpl.fem import Material, ModalLoads
 from dpl.models import Unrolled
-from dpl.models.unrolled.features import SampleCells
+from dpl.models.unrolled import features
 from dpl.system.threads import one_thread
 from dpl.training.metrics import errors_of
 from dpl.visualization import COLOURS, draw_body
@@ -96,15 +96,15 @@ class _OneStress:
     kept: int
 
     def __call__(self) -> AbstractContextManager[Any]:
-        both = SampleCells.features
+        both = features.unbalanced_stress
 
-        def features(cells: SampleCells, law: Material, c: Tensor, linear: Tensor) -> Tensor:
-            stress = both(cells, law, c, linear)
+        def unbalanced_stress(law: Material, H: Tensor, linear: Tensor) -> Tensor:
+            stress = both(law, H, linear)
             one = torch.zeros_like(stress)
-            one[:, :, self.kept] = stress[:, :, self.kept]
+            one[..., self.kept, :, :] = stress[..., self.kept, :, :]
             return one
 
-        return mock.patch.object(SampleCells, "features", features)
+        return mock.patch.object(features, "unbalanced_stress", unbalanced_stress)
 
 
 def fitted(

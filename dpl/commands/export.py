@@ -69,12 +69,14 @@ def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder
     errors = _test_errors(Path(cfg.run))
     path, start = folder / MODEL, time.perf_counter()
     with config.error_in("run"):
-        export.export_onnx(surrogate, path)
+        export.export_onnx(surrogate, path, numbers=cfg.numbers, dtype=cfg.dtype)
     seconds = time.perf_counter() - start
     export.write_folder(surrogate, folder, tol=cfg.tol, errors=errors)
+    session = export.OnnxSession(path)
     loads = comparison.sample_check_loads(surrogate.scene, cfg.samples)
-    rows = comparison.compare_outputs(surrogate, export.OnnxSession(path), *loads)
+    rows = comparison.compare_outputs(surrogate, session, *loads)
     tables.show(rows, "ONNX against torch")
+    times = comparison.latencies(surrogate, session, cfg.samples)
     largest = max(row.max_error for row in rows)
     size = sum(file.stat().st_size for file in folder.glob(f"{MODEL}*"))
     report = {
@@ -85,6 +87,7 @@ def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder
         "loads": [asdict(row) for row in rows],
         "bytes": size,
         "export_seconds": round(seconds, 2),
+        "milliseconds": {name: asdict(own) for name, own in times.items()},
         "machine": tables.machine(),
         "versions": {name: version(name) for name in ("torch", *PACKAGES)},
     }
@@ -100,6 +103,7 @@ def export_model(cfg: DictConfig, surrogate: "training.TrainedSurrogate", folder
         )
         sys.exit(1)
     print(f"largest difference {largest:.1e}; {path}, {size / 1e6:.3g} MB, {seconds:.1f} s")
+    print("; ".join(f"{name}: {own}" for name, own in times.items()))
 
 
 def _test_errors(folder: Path) -> dict[str, float] | None:

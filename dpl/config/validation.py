@@ -25,6 +25,8 @@ KEYS: Keys = (  # of all commands
     (str, "name host license"),
     (Literal["generate", "verify", "repair"], "action"),
     (Sequence[Literal["model", "results", "runtime", "dataset", "publish"]], "outputs"),
+    (Sequence[Literal["error", "amplitude", "residual", "min_det_F"]], "numbers"),
+    (Literal["float64", "float32"], "dtype"),
     (str | None, "run folder ckpt_path animation"),
     (Sequence[str], "tags allowed_hosts"),
     (Sequence[str] | None, "networks"),

@@ -1,12 +1,15 @@
 """Comparison of an ONNX graph with its surrogate: largest differences."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.evaluation import Latency, latency
 from dpl.export.onnx_graph import Array, OnnxSession
+from dpl.export.quantities import Quantities
 from dpl.fem import Load
 from dpl.scene import Scene
 from dpl.training import TrainedSurrogate
@@ -14,6 +17,7 @@ from dpl.training import TrainedSurrogate
 CHECK_STREAM = (0, 11)  # random stream of the loads of the comparison
 IN_RANGE = "in range"
 AMPLITUDES = {"small": 1e-3, "tiny": 1e-9, "large": 10.0}  # factors on loads in the training range
+REPEATS = 3  # calls with each load whose times are measured
 N_OUTSIDE = 4  # loads of each kind outside the training range
 
 
@@ -23,7 +27,8 @@ class OutputDifference:
 
     kind: str
     n_loads: int
-    max_error: float  # largest relative difference ||a - b|| / ||b|| [-]
+    max_error: float  # largest relative difference of displacements, ||a - b|| / ||b|| [-]
+    max_number_error: float  # largest relative difference of the other outputs [-]
 
 
 def sample_check_loads(scene: Scene, count: int) -> tuple[list[str], dict[str, Tensor]]:
@@ -58,23 +63,37 @@ def compare_outputs(
     All loads are evaluated at once, then the first three, then each load alone, to detect a graph
     with a fixed batch size.
     """
-    count = len(kinds)
-    largest = np.zeros(count)
-    for part in (slice(0, count), slice(0, 3), *(slice(k, k + 1) for k in range(count))):
+    module, rows = Quantities(surrogate, session.outputs[1:]), list[OutputDifference]()
+    largest = np.zeros((2, len(kinds)))
+    for part in (slice(0, len(kinds)), slice(0, 3), *(slice(k, k + 1) for k in range(len(kinds)))):
         some = {name: column[part] for name, column in inputs.items()}
         with torch.inference_mode():
-            expected = surrogate(**some).numpy()
-        largest[part] = np.maximum(largest[part], relative_differences(session(**some), expected))
-    rows = []
+            expected = [one.numpy() for one in module(**some)]
+        pairs = zip(session(**some).values(), expected, strict=True)
+        first, *others = (relative_differences(*pair) for pair in pairs)
+        both = first, np.max([0 * first, *others], axis=0)
+        largest[:, part] = np.maximum(largest[:, part], both)
     for kind in dict.fromkeys(kinds):
-        own = largest[[one == kind for one in kinds]]
-        rows.append(OutputDifference(kind, len(own), float(own.max())))
+        own = largest[:, [one == kind for one in kinds]]
+        rows.append(OutputDifference(kind, own.shape[1], *own.max(axis=1).tolist()))
     return rows
 
 
+def latencies(surrogate: TrainedSurrogate, session: OnnxSession, count: int) -> dict[str, Latency]:
+    """Return the latencies of an ONNX file and of its surrogate for `count` loads in range."""
+    load = surrogate.scene.loads.sample(CHECK_STREAM, range(count))
+    inputs: list[dict[str, Any]] = [surrogate.scene.si_inputs(one) for one in load.unbatch()]
+    return {
+        "onnxruntime": latency(lambda one: session(**one), inputs, repeats=REPEATS),
+        "torch": latency(lambda one: surrogate(**one), inputs, repeats=REPEATS),
+    }
+
+
 def relative_differences(found: Array, expected: Array) -> Array:
-    """Return ||a - b|| / ||b|| of fields (B, N, D), (B,) [-]; 0 where both are zero."""
-    difference, size = (np.linalg.norm(x, axis=(1, 2)) for x in (found - expected, expected))
+    """Return ||a - b|| / ||b|| of fields (B, ...), (B,) [-]; 0 where both are equal."""
     with np.errstate(divide="ignore", invalid="ignore"):
+        difference = np.where(found == expected, 0.0, found - expected)  # both may be infinite
+        both = (x.reshape(len(x), -1) for x in (difference, expected))
+        difference, size = (np.linalg.norm(x, axis=1) for x in both)
         ratio = np.where(difference == 0, 0.0, difference / size)
     return np.where(np.isfinite(ratio), ratio, np.inf)

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from dpl.export.comparison import CHECK_STREAM
 from dpl.export.onnx_graph import Array
+from dpl.export.quantities import NUMBERS
 from dpl.fem import ModalLoads, Problem, evaluate_solution, solve, surface
 from dpl.fem.mesh.writing import with_nodes
 from dpl.fem.postprocess import triangles
@@ -132,9 +133,14 @@ def _model(scene: Scene, path: Path, force_unit: str) -> dict[str, Any]:
             "ranges": loads.parameter_ranges,
         },
         "displacement": {"shape": field, "unit": "m"},
+        **{name: {"shape": ["B"], "unit": "1"} for name in NUMBERS},
     }
+    types = {onnx.TensorProto.DOUBLE: "float64", onnx.TensorProto.FLOAT: "float32"}
     inputs, outputs = (
-        [{"name": one.name, "type": "float64", **known[one.name]} for one in values]
+        [
+            {"name": one.name, "type": types[one.type.tensor_type.elem_type], **known[one.name]}
+            for one in values
+        ]
         for values in (stored.graph.input, stored.graph.output)
     )
     opset = int(stored.opset_import[0].version)

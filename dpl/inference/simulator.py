@@ -31,7 +31,9 @@ from dpl.training import TrainedSurrogate
 
 ERROR = 1e-3  # estimated relative error in the modes at which the steps end [-]
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
-WORTH = 1 / 3  # known error after steps in the modes over that before, below which they are made [-]
+WORTH = (
+    1 / 3
+)  # known error after steps in the modes over that before, below which they are made [-]
 MAX_RESIDUAL = 1.0  # above it the error outside of the modes is not that of the training [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 

@@ -168,32 +168,43 @@ class LinearResponse:
 
         Moved supports are part of them and keep their prescribed displacements.
         """
-        problem = self.scene.problem
         force, parameters = self.dead_loads(load.force.double(), load.parameters)
-        free = problem.free.to(force.device)
-        values = self(force[:, free], parameters)
-        prescribed = problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
-        dofs = free.flatten().nonzero()[:, 0]
-        return prescribed.index_copy(1, dofs, values).view_as(force)
+        _, solved = self.by_parity(force, parameters)
+        return self.fields(solved) + self.scene.problem.prescribed.to(solved)
 
     def __call__(self, loaded: Tensor, parameters: Tensor) -> Tensor:
         """Return linear solutions (B, n) at free degrees of freedom of forces (B, n) on them.
 
         The parameters, (B, P), are those of the law.
         """
-        images, signs, scales, characters, supports, places = self._orbits(loaded.device)
+        free = self.scene.problem.free.to(loaded.device)
+        force = loaded.new_zeros(loaded.shape[0], *free.shape)
+        force = force.flatten(1).index_copy(1, free.flatten().nonzero()[:, 0], loaded)
+        return self.fields(self.by_parity(force, parameters)[1])[:, free].to(loaded)
+
+    def by_parity(self, force: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """Return forces (B, N, D) and their linear solutions by parity, (B, M, m) float64 each."""
+        dofs, _, scales, characters, supports, _ = self._orbits(force.device)
         law = self.scene.problem.material.with_parameters(parameters)
-        factors = self.terms.factors(law).double().expand(loaded.shape[0], -1)
+        factors = self.terms.factors(law).double().expand(force.shape[0], -1)
         factors = pad(factors, (0, 1), value=1.0)
-        with full_precision(loaded.device.type):
-            parts = characters @ (scales * loaded.double()[:, images])  # (B, M, m)
+        with full_precision(force.device.type):
+            rows = force.double().flatten(1).index_select(1, dofs.flatten())
+            parts = characters @ (scales * rows.unflatten(1, dofs.shape))
             right = parts.flatten(1) - factors @ supports
             if torch.compiler.is_compiling():
                 solved = self.by_tensors(right, factors)
             else:
                 solved = _Solve.apply(right, factors, self)
-            values = signs * (characters.T @ solved.view_as(parts))
-        return values.flatten(1)[:, places].to(loaded)
+        return parts, solved.view_as(parts)
+
+    def fields(self, parts: Tensor) -> Tensor:
+        """Return fields (B, N, D), zero at fixed degrees of freedom, of their parts (B, M, m)."""
+        _, signs, _, characters, _, places = self._orbits(parts.device)
+        with full_precision(parts.device.type):
+            values = signs * (characters.T @ parts)
+        fields = pad(values.flatten(1), (0, 1)).index_select(1, places)
+        return fields.unflatten(1, self.scene.problem.shape)
 
     def solve(self, right: Tensor, factors: Tensor) -> Tensor:
         """Return K(0)^-1 f, (B, M m), of forces by parity, (B, M m), without derivatives.
@@ -203,7 +214,7 @@ class LinearResponse:
         many = right.shape[0] > FEW and not self.terms.varies  # which need no steps
         if right.device.type != "cpu" or many:
             return self.by_tensors(right, factors)
-        size, shape = _largest(right), self.orbits.dofs.shape
+        size, shape = largest(right), self.orbits.dofs.shape
         parts = (right / size).numpy().reshape(-1, *shape).astype(self.blocks.values.dtype)
         rows = list(zip(parts, factors.numpy(), strict=True))
         found = on_threads(lambda row: self._inverse(row[1])(row[0]), rows)
@@ -211,19 +222,19 @@ class LinearResponse:
 
     def by_tensors(self, right: Tensor, factors: Tensor) -> Tensor:
         """Return the same as `solve` by tensor operations."""
-        layers, columns, entries = self.tensors(right.device)
+        layers, places, columns, entries = self.tensors(right.device)
         count = max(1, MAX_VALUES // max(columns.numel(), self.blocks.values.size))
         if not torch.compiler.is_compiling() and right.shape[0] > count:
             both = zip(right.split(count), factors.split(count), strict=True)
             return torch.cat([self.by_tensors(*pair) for pair in both])
 
         def of_node(f: Tensor) -> Tensor:
-            forces = f.unflatten(1, (len(self.blocks.values), -1)).transpose(0, 1)
-            solved = solve_layers(layers, forces.to(layers[0].inverse.dtype))
-            return solved.transpose(0, 1).flatten(1).double()
+            forces = f.unflatten(1, (len(self.blocks.values), -1)).permute(2, 1, 0)
+            solved = solve_layers(layers, places, forces.to(layers[0].inverse.dtype))
+            return solved.permute(2, 1, 0).flatten(1).double()
 
         if not self.terms.varies:
-            size = _largest(right)
+            size = largest(right)
             return of_node(right / size) * size
         matrix = torch.einsum("bk,knw->bnw", factors, entries)
 
@@ -234,27 +245,27 @@ class LinearResponse:
         return conjugate_gradients_of_tensors(product, of_node, right, *ends)
 
     def _orbits(self, device: torch.device) -> list[Tensor]:
-        """Return images, signs, scales, characters and forces of supports, see `OrbitArrays`.
+        """Return dofs, signs, scales, characters and forces of supports, see `OrbitArrays`.
 
-        The last one is the position of each free degree of freedom among the images, (n,).
+        The last one is the position of each degree of freedom among the images; M m of fixed ones.
         """
 
         def make() -> list[Tensor]:
-            parities, orbits, _ = self.form
-            places = torch.empty(int(orbits.images.max()) + 1, dtype=torch.int64)
-            places[orbits.images.flatten()] = torch.arange(orbits.images.numel())
-            scales = orbits.sign * orbits.weight
-            own = orbits.images, orbits.sign, scales, parities.characters, self._supports, places
+            characters, *arrays = self.orbits
+            dofs, signs, scales = map(torch.from_numpy, arrays)
+            places = torch.full((self.scene.problem.free.numel(),), dofs.numel())
+            places[dofs.flatten()] = torch.arange(dofs.numel())
+            own = dofs, signs, scales, torch.from_numpy(characters), self._supports, places
             return [part.to(device) for part in own]
 
         return self._on(device, "orbits", make)
 
     def tensors(self, device: torch.device) -> list[Any]:
-        """Return the layers of the node, and columns and entries of `TermMatrices.padded`."""
+        """Return `condensed_layers` of the node, columns and entries of `TermMatrices.padded`."""
 
         def make() -> list[Any]:
             terms = self._matrices.padded() if self.terms.varies else (torch.zeros(0).long(),) * 2
-            return [condensed_layers(self.blocks, device), *(part.to(device) for part in terms)]
+            return [*condensed_layers(self.blocks, device), *(part.to(device) for part in terms)]
 
         return self._on(device, "blocks", make)
 
@@ -282,12 +293,12 @@ class _Solve(Function):
         right: Tensor = _Solve.apply(gradients[0], factors, ctx.response)
         of_factors = None
         if ctx.needs_input_grad[1] and ctx.response.terms.varies:
-            _, columns, entries = ctx.response.tensors(x.device)
+            _, _, columns, entries = ctx.response.tensors(x.device)
             of_factors = -torch.einsum("bn,bnw,knw->bk", right, x[:, columns], entries)
         return right, of_factors, None
 
 
-def _largest(right: Tensor) -> Tensor:
+def largest(right: Tensor) -> Tensor:
     """Return the largest entries (B, 1) of rows, over which float32 holds them; 1 of zeros."""
     size = right.abs().amax(dim=1, keepdim=True)
     return torch.where(size > 0, size, 1.0)

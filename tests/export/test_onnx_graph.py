@@ -17,6 +17,8 @@ from dpl import fem
 from dpl.export import OnnxSession, compare_outputs, comparison, export_onnx, write_folder
 from dpl.export.comparison import relative_differences, sample_check_loads
 from dpl.export.onnx_graph import missing_packages
+from dpl.export.quantities import NUMBERS, Quantities, position
+from dpl.inference.answer import RangeCheck
 from dpl.models import CNN, FCNN, GNN, Inputs, PODNet, Unrolled
 from dpl.training import TrainedSurrogate, checkpoints
 
@@ -92,6 +94,7 @@ NETWORKS = {
 }
 
 
+WITH_NUMBERS = {"unrolled": NUMBERS, "unrolled, poisson": NUMBERS[:2]}
 RARE = {"fcnn, young", "fcnn, poisson", "cnn", "cnn, immersed", "gnn, edges", "gnn, poisson", "pod"}
 RARE |= {"unrolled, three terms", "unrolled, poisson", "unrolled, quadratic, no symmetry"}
 EVERY = [pytest.param(one, marks=pytest.mark.slow) if one in RARE else one for one in NETWORKS]
@@ -111,7 +114,7 @@ def make_graph(make_scene, tmp_path_factory):
             }
             surrogate = make_surrogate(make, make_scene(**scene), **options)
             path = tmp_path_factory.mktemp("graph") / "model.onnx"
-            export_onnx(surrogate, path)
+            export_onnx(surrogate, path, numbers=WITH_NUMBERS.get(name, ()))
             graphs[name] = surrogate, path
         return graphs[name]
 
@@ -143,7 +146,79 @@ def test_onnx_and_torch_agree_for_all_kinds_of_loads_and_batch_sizes(make_graph,
         small["force"] = 1e-6 * small["force"]
         states = scene.linear.iterate(scene.load_of(**small))
         linear = scene.length * next(iter(states)).displacement.numpy()
-        assert relative_differences(pair[1](**small), linear).max() < 1e-4
+        assert relative_differences(pair[1](**small)["displacement"], linear).max() < 1e-4
+
+
+def in_parts(load):
+    """Return loads, and the same on the first half of the nodes, on none, and 3 times as large."""
+    force = load.force.clone()
+    force[:, len(force[0]) // 2 :] = 0.0
+    every = torch.cat([load.force, force, 0 * force, 3 * load.force])
+    return fem.Load(every, load.young.repeat(4), load.parameters.repeat(4, 1))
+
+
+def determined(force):
+    """Return True for loads on no node or on enough nodes to determine three coefficients."""
+    nodes = (force != 0).any(dim=2).sum(dim=1)
+    return (nodes == 0) | (nodes > 3)
+
+
+def test_numbers_are_those_of_python(make_graph):
+    surrogate, path = make_graph("unrolled")
+    session, scene = OnnxSession(path), surrogate.scene
+    assert session.outputs == ["displacement", *NUMBERS]
+    load = in_parts(scene.loads.sample((0, 12), range(4)))
+    found = session(**scene.si_inputs(load))
+    u = torch.from_numpy(found["displacement"]) / scene.length
+    for k, single in enumerate(load.unbatch()):
+        body = scene.problem.with_parameters(single.parameters)
+        internal, lowest = body.evaluate(u[k : k + 1])
+        residual = float(body.relative_residual_of(internal, single.force))
+        assert found["residual"][k] == pytest.approx(residual, rel=1e-6)
+        assert found["min_det_F"][k] == pytest.approx(float(lowest), rel=1e-12)
+    many = determined(load.force)
+    amplitude = scene.loads.project(load.force)[0].numpy()
+    assert found["amplitude"][many] == pytest.approx(amplitude[many], rel=1e-6, abs=1e-12)
+    inside = torch.tensor([place.inside for place in RangeCheck.of(surrogate, load)])
+    assert inside[many].any()
+    assert not inside[many].all()
+    with torch.inference_mode():
+        errors = surrogate.predict_with_errors(load)[1][:, 0]
+    expected = torch.where(inside, errors, torch.inf).numpy()
+    assert found["error"][many] == pytest.approx(expected[many], rel=1e-3)  # float32 products
+
+
+def test_residuals_of_a_body_with_ranges_are_refused(make_scene):
+    surrogate = make_surrogate(FCNN, make_scene(poisson=[0.2, 0.4]), width=16)
+    with pytest.raises(ValueError, match=r"^numbers = residual must be evaluated without ranges"):
+        Quantities(surrogate, ["error", "residual"])
+
+
+def test_amplitudes_are_those_of_the_family(make_scene):
+    linear, end = (scene := make_scene()).linear, fem.Plane(0, "max")
+    vectors = fem.FaceTractions(linear, region=end), fem.FacePressure(linear, region=end)
+    for loads in (scene.loads, *vectors, fem.PointLoads(linear)):
+        force = in_parts(loads.sample((0, 12), range(4))).force
+        pairs, many = (
+            zip(position(loads, force), loads.project(force), strict=True),
+            determined(force),
+        )
+        for one, other in pairs:
+            assert torch.allclose(one[many], other[many], rtol=1e-6, atol=1e-6, equal_nan=True)
+
+
+def test_a_graph_in_float32_has_no_other_type(make_graph, tmp_path):
+    import onnx
+
+    surrogate, _ = make_graph("unrolled")
+    export_onnx(surrogate, path := tmp_path / "model.onnx", numbers=NUMBERS, dtype="float32")
+    graph = onnx.load(str(path)).graph
+    double = onnx.TensorProto.DOUBLE
+    typed = [*graph.input, *graph.output, *graph.value_info]
+    assert all(one.type.tensor_type.elem_type != double for one in typed)
+    assert all(one.data_type != double for one in graph.initializer)
+    rows = compare_outputs(surrogate, OnnxSession(path), *sample_check_loads(surrogate.scene, 8))
+    assert max(row.max_error for row in rows) < 1e-3
 
 
 class ValueDependent(nn.Module):
@@ -228,7 +303,8 @@ def test_the_reference_has_the_displacements_of_surrogate_and_finite_elements(wr
     load = scene.load_of(torch.from_numpy(found["force"]), torch.from_numpy(found["young"]))
     exact = torch.from_numpy(found["fe_displacement"]) / scene.length
     assert float(scene.problem.relative_residual(exact, load.force)) < 1e-8
-    answer = OnnxSession(folder / "model.onnx")(force=found["force"], young=found["young"])
+    session = OnnxSession(folder / "model.onnx")
+    answer = session(force=found["force"], young=found["young"])["displacement"]
     assert relative_differences(answer, found["displacement"]) < 1e-5
 
 

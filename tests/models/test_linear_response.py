@@ -117,7 +117,7 @@ def test_tensor_operations_and_compiled_loops_solve_alike(scene):
     law = scene.problem.material.with_parameters(parameters(scene, 5))
     factors = response.terms.factors(law).expand(5, -1)
     pair = torch.stack(right), torch.nn.functional.pad(factors, (0, 1), value=1.0)
-    assert relative(response.solve(*pair), response.by_tensors(*pair)) < 1e-6
+    assert relative(response.solve(*pair), response.by_tensors(*pair)) < 2e-6  # in float32
 
 
 def test_locking_elements_do_not_change_the_bound():

@@ -172,7 +172,7 @@ class Discretisation:
 
     def _sum_at_nodes(self, per_cell: Tensor) -> Tensor:
         """Return the sums at nodes (B, N, D) of values of each cell at its nodes (B, E, A, D)."""
-        force = per_cell.new_zeros(len(per_cell), *self.shape)
+        force = per_cell.new_zeros(per_cell.shape[0], *self.shape)
         return force.index_add(1, self.cells.flatten(), per_cell.flatten(1, 2))
 
     def relative_rounding(self, material: Material) -> Tensor:

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
-from torch.nn.functional import pad
 
 from dpl.fem.linear.interface import SingularMatrix
 
@@ -265,14 +264,18 @@ def add_inverses(
 class Layer(NamedTuple):
     """Fronts of the same height and similar sizes, filled to one size; none depends on another."""
 
-    pivots: Tensor  # pivots of each front, n where there are fewer, (k, I)
-    boundary: Tensor  # their boundaries, n where there are fewer, (k, J)
+    pivots: Tensor  # pivots of each front, n where there are fewer, (k I,)
+    received: Tensor  # positions of F_JI F_II^-1 f of layers before, w for each pivot, (w, k I)
+    boundary: Tensor  # positions among the solutions of layers behind, the last one first, (k, J)
     inverse: Tensor  # F_II^-1 of P matrices, zero in filled rows and columns, (P, k, I, I)
     coupling: Tensor  # X, (P, k, I, J)
 
 
-def condensed_layers(blocks: Condensed, device: torch.device | str) -> list[Layer]:
-    """Return the blocks on a device, in their dtype, fronts without children first."""
+def condensed_layers(blocks: Condensed, device: torch.device | str) -> tuple[list[Layer], Tensor]:
+    """Return the blocks on a device, in their dtype, and the position of each solution, (n,).
+
+    Fronts without children come first.
+    """
     table, unknowns, heights, values = blocks
     size, widths = len(np.unique(unknowns)), np.diff(table[:, :3])  # numbers of pivots, boundary
     kinds = np.stack([heights, np.rint(2 * np.log2(widths[:, 0])).astype(int)], axis=1)
@@ -290,26 +293,50 @@ def condensed_layers(blocks: Condensed, device: torch.device | str) -> list[Laye
             square, rest = np.split(block, [own * own], axis=1)
             inverse[:, k, :own, :own] = square.reshape(len(values), own, own)
             coupling[:, k, :own, :other] = rest.reshape(len(values), own, other)
-        arrays = pivots, boundary, inverse, coupling
-        layers.append(Layer(*(torch.from_numpy(array).to(device) for array in arrays)))
-    return layers
+        layers.append((pivots.ravel(), boundary, inverse, coupling))
+    every = [np.concatenate([[size], *(layer[k].ravel() for layer in layers)]) for k in (0, 1)]
+    received, solved = _positions(every[1], size), np.zeros(size + 1, np.int64)
+    behind = np.concatenate([[size], *(pivots for pivots, *_ in reversed(layers))])
+    solved[behind[::-1]] = np.arange(len(behind))[::-1]  # the n-th unknown is the first one, zero
+    found = []
+    for pivots, boundary, *matrices in layers:
+        rows = received[pivots]
+        rows = rows[:, : int((rows > 0).sum(axis=1).max())].T.copy()
+        arrays = pivots, rows, solved[boundary], *matrices
+        found.append(Layer(*(torch.from_numpy(array).to(device) for array in arrays)))
+    return found, torch.from_numpy(solved[:-1]).to(device)
 
 
-def solve_layers(layers: Sequence[Layer], right: Tensor) -> Tensor:
-    """Return the solutions (P, B, n) of right-hand sides (P, B, n) of the dtype of the blocks.
+def _positions(names: Integers, count: int) -> Integers:
+    """Return the positions of each name below `count`, filled with 0, (count + 1, w)."""
+    order = np.argsort(names, kind="stable")[: int((names < count).sum())]
+    which = names[order]
+    number = np.arange(len(which)) - np.searchsorted(which, which)  # among those of the same name
+    rows = np.zeros((count + 1, int(number.max(initial=0)) + 1), np.int64)
+    rows[which, number] = order
+    return rows
 
-    Each layer is a product of batches of matrices, for batches, gradients, GPUs and graphs. The
-    n-th unknown, where fronts are filled, is always zero.
+
+def solve_layers(layers: Sequence[Layer], places: Tensor, right: Tensor) -> Tensor:
+    """Return the solutions (n, P, B) of right-hand sides (n, P, B) of the dtype of the blocks.
+
+    The first arguments are those of `condensed_layers`. Each layer is a product of batches of
+    matrices, for batches, gradients, GPUs and graphs. The unknowns are the first axis, whose rows
+    onnxruntime copies whole, and the batch is the last one, so that one load is a column.
     """
-    force, inner = pad(right, (0, 1)), []
+    zero = torch.zeros_like(right[:1])
+    force, passed, solved, inner = torch.cat([right, zero]), zero, zero, []
     for layer in layers:
-        own = force[..., layer.pivots].transpose(1, 2)  # (P, k, B, I)
-        inner.append(own @ layer.inverse)
-        passed = (own @ layer.coupling).transpose(1, 2).flatten(2)
-        force = force.index_add(2, layer.boundary.flatten(), -passed)
-    solution = torch.zeros_like(force)
+        own = force.index_select(0, layer.pivots)
+        if len(layer.received):
+            terms = passed.index_select(0, layer.received.flatten())
+            own = own - terms.unflatten(0, layer.received.shape).sum(0)
+        own = own.unflatten(0, layer.inverse.shape[1:3])  # (k, I, P, B)
+        inner.append(layer.inverse @ own.permute(2, 0, 1, 3))
+        terms = own.permute(2, 0, 3, 1) @ layer.coupling  # (P, k, B, J)
+        passed = torch.cat([passed, terms.permute(1, 3, 0, 2).flatten(0, 1)])
     for layer, own in zip(reversed(layers), reversed(inner), strict=True):
-        outer = solution[..., layer.boundary].transpose(1, 2)
-        found = (own - outer @ layer.coupling.transpose(2, 3)).transpose(1, 2).flatten(2)
-        solution = solution.index_add(2, layer.pivots.flatten(), found)
-    return solution[..., :-1]
+        outer = solved.index_select(0, layer.boundary.flatten()).transpose(0, 1)
+        found = own - layer.coupling @ outer.unflatten(1, layer.boundary.shape)
+        solved = torch.cat([solved, found.flatten(1, 2).transpose(0, 1)])
+    return solved.index_select(0, places)

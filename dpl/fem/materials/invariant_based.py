@@ -11,6 +11,7 @@ from dpl.fem.materials.tensors import (
     green_lagrange,
     invariants,
     inverse_transpose,
+    product,
     symmetric_product,
     trace,
     volume_change,
@@ -79,7 +80,7 @@ class InvariantBasedMaterial(Material):
         J is that of H, with its sign: inverted, a law with ln J has no stress (NaN).
         """
         S, _ = self._stress(2 * green_lagrange(H), volume_change(H))
-        return S + H @ S
+        return S + product(H, S)
 
     def _stress(self, e: Tensor, j: Tensor) -> tuple[Tensor, Derivatives]:
         """Return S (..., 3, 3) at e = C - I where J = 1 + j, and the derivatives that make it."""
@@ -92,5 +93,5 @@ class InvariantBasedMaterial(Material):
         if isinstance(W2, Tensor) or W2:
             S = S - 2 * W2 * e
         if isinstance(p, Tensor) or p:  # else a collapsed body, C singular, has a stress too
-            S = S - p * (e @ inverse_transpose(e, square))
+            S = S - p * product(e, inverse_transpose(e, square))
         return S, found

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from dpl.fem.materials.tensors import product
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
 
@@ -27,8 +28,8 @@ def rotated_strain(H: Tensor) -> Tensor:
     first = torch.where(small, series, angle.sin() / angle - 1)  # sin(t)/t - 1
     cosine = 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90)))
     second = torch.where(small, cosine, (1 - angle.cos()) / angle**2)
-    beyond = first * W + second * (W @ W)  # exp(W) - I - W
-    return beyond + (W + beyond) @ e
+    beyond = first * W + second * product(W, W)  # exp(W) - I - W
+    return beyond + product(W + beyond, e)
 
 
 def warped_solution(solver: LinearSolver, load: Load) -> Tensor:

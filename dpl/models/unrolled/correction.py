@@ -31,7 +31,7 @@ def fit_errors(sizes: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
     Source: Allen (1974), Technometrics 16 (leave-one-out residuals of a ridge regression).
 
     Args:
-        sizes: Sizes of held-out predictions, (S, K + 2), see `Maps`.
+        sizes: Sizes of held-out predictions, (S, K + 2).
         errors: Their true relative errors, (S,) [-].
     """
     tiny = torch.finfo(torch.float64).tiny

@@ -11,10 +11,18 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from dpl.fem.materials.material import Material
-from dpl.fem.materials.tensors import cofactor, volume_change
+from dpl.fem.materials.tensors import product, volume_change
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.rotation_strain import rotated_strain
 from dpl.models.unrolled.feature_loops import MIN_VOLUME_RATIO, POLAR_ITER
+
+# entries (i+1, j+1), (i+2, j+2), (i+1, j+2), (i+2, j+1) modulo 3 of a matrix, (4, 9)
+MINORS = torch.tensor(
+    [
+        [3 * ((i + di) % 3) + (j + dj) % 3 for i in range(3) for j in range(3)]
+        for di, dj in ((1, 1), (2, 2), (1, 2), (2, 1))
+    ]
+)
 
 
 class SampleCells(NamedTuple):
@@ -94,7 +102,7 @@ def unbalanced_stress(law: Material, H: Tensor, linear: Tensor) -> Tensor:
     valid = volume_change(H) > MIN_VOLUME_RATIO - 1
     H = torch.where(valid[..., None, None], H, 0.0)
     stress = law.stress(H) - law.rest_stress(linear)
-    return torch.stack([rotation(H).mT @ stress, stress], dim=-3)
+    return torch.stack([product(rotation(H).mT, stress), stress], dim=-3)
 
 
 def rotation(H: Tensor) -> Tensor:
@@ -102,9 +110,10 @@ def rotation(H: Tensor) -> Tensor:
 
     Source: Higham (1986), SIAM J. Sci. Stat. Comput. 7: X <- (X + X^-T) / 2.
     """
-    X = H + torch.eye(3, dtype=H.dtype, device=H.device)
+    F = H + torch.eye(3, dtype=H.dtype, device=H.device)
+    X = F.flatten(-2).movedim(-1, 0)  # components first: work runs along rows, graphs are small
     for _ in range(POLAR_ITER):
-        minors = cofactor(X)
-        det = (X[..., 0, :] * minors[..., 0, :]).sum(dim=-1)
-        X = (X + minors / det[..., None, None]) / 2
-    return X
+        a, b, c, d = (X.index_select(0, rows) for rows in MINORS.to(H.device))
+        minors = a * b - c * d
+        X = (X + minors / (X[:3] * minors[:3]).sum(dim=0)) / 2
+    return X.movedim(0, -1).unflatten(-1, (3, 3))

@@ -1,7 +1,7 @@
 """Fit of `dpl.models.Unrolled` to samples: modes, sample cells and maps."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,7 +16,8 @@ from dpl.models.unrolled.features import SampleCells, cell_gradients, mechanical
 from dpl.models.unrolled.regression import MapParities, fit_map, weighted_error
 from dpl.scene import Sample
 
-CHUNK = 256  # samples whose fields or features are computed at a time
+CHUNK = 256  # samples whose fields are computed at a time
+FEW = 16  # samples whose features are computed at a time, in the caches of a processor
 SIZE_EXPONENT = -0.4  # errors count relative to the displacement to this power
 MAX_ROWS = 2**14  # samples and images to which maps are fitted
 MAX_BYTES = 2**31  # of snapshots and images from which modes are computed, in float32
@@ -40,32 +41,10 @@ class Maps(NamedTuple):
     matrices: Sequence[Tensor]
     limits: Tensor
 
-    def __call__(self, law: Material, linear: Tensor) -> tuple[Tensor, Tensor]:
-        """Return coordinates (B, R) of nonlinear displacements, and sizes (B, K + 2).
 
-        The sizes are the norms of the linear coordinates and of the correction by each map.
-
-        Args:
-            law: The law, see `Material.with_parameters`.
-            linear: Coordinates of Galerkin linear solutions, (B, R).
-        """
-        first, *others = self.matrices
-        H = self.cells.gradient(linear)
-        step = self.cells.first_features(H).flatten(1) @ first
-        c = step = limit_step(step, linear, self.limits[0])
-        steps = [linear, step]
-        for matrix, limit in zip(others, self.limits[1:], strict=True):
-            proposed = self.cells.features(law, linear + c, H).flatten(1) @ matrix
-            step = limit_step(proposed, step, limit)
-            c = c + step
-            steps.append(step)
-        return c, torch.stack(steps, dim=1).norm(dim=2)
-
-
-def limit_step(step: Tensor, before: Tensor, limit: Tensor) -> Tensor:
-    """Return steps (B, R), shortened to `limit` times the norm of the steps before (B, R)."""
-    most = limit * before.norm(dim=1, keepdim=True)
-    size = step.norm(dim=1, keepdim=True)
+def limit_step(step: Tensor, before: Tensor, limit: Tensor, dim: Any = 1) -> Tensor:
+    """Return steps, shortened to `limit` times the norm of the steps before, both (B, R)."""
+    most, size = limit * before.norm(dim=dim, keepdim=True), step.norm(dim=dim, keepdim=True)
     return torch.where(size > most, step * (most / size.clamp(min=1e-300)), step)
 
 
@@ -224,9 +203,9 @@ def maps_at_cells(
 def _features(law: Material, cells: SampleCells, samples: Columns, c: Tensor | None) -> Tensor:
     """Return features (S, C, F, D, D) of the first map, or of the others at coordinates (S, R)."""
     if c is None:
-        parts = [cells.first_features(cells.gradient(part)) for part in samples.linear.split(CHUNK)]
+        parts = [cells.first_features(cells.gradient(part)) for part in samples.linear.split(FEW)]
         return torch.cat(parts)
-    columns = (column.split(CHUNK) for column in (samples.linear, c, samples.parameters))
+    columns = (column.split(FEW) for column in (samples.linear, c, samples.parameters))
     return torch.cat(
         [
             cells.features(law.with_parameters(own), linear + part, cells.gradient(linear))

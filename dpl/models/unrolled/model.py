@@ -5,10 +5,12 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dpl.fem import InvariantBasedMaterial, SubspaceNewton, estimate_error, symmetries
 from dpl.fem.assembly.kernels import call_compiled
 from dpl.fem.materials.heterogeneous import one_law
+from dpl.fem.materials.material import Material
 from dpl.fem.parity import Parities
 from dpl.fem.rom.ecsw import Cubature
 from dpl.fem.rom.pod import orthonormal_fields
@@ -16,12 +18,12 @@ from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.symmetry import SymmetryGroup
 from dpl.models.interface import StoredBuffers, check_indices
 from dpl.models.linear_base import SCALE_STREAM
-from dpl.models.linear_response import Array, LinearResponse, Solve
+from dpl.models.linear_response import Array, LinearResponse, OrbitArrays, Solve, largest
 from dpl.models.unrolled.compiled import LawArguments, law_arguments, model_arrays
 from dpl.models.unrolled.correction import LOADS, choose_newton, fit_errors, relative_errors
-from dpl.models.unrolled.features import SampleCells
-from dpl.models.unrolled.fit import Maps, fit_in_best_modes
+from dpl.models.unrolled.fit import fit_in_best_modes
 from dpl.models.unrolled.loops import ModelArrays, predict
+from dpl.models.unrolled.products import Tensors, nonlinear_coordinates
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.threads import on_threads
@@ -108,7 +110,6 @@ class Unrolled(StoredBuffers):
     error_exponents: Tensor
     least_sizes: Tensor
     fitted: Tensor
-    dofs: Tensor
     prescribed: Tensor
 
     def __init__(
@@ -142,9 +143,8 @@ class Unrolled(StoredBuffers):
         for name, (shape, dtype) in self._layout().items():
             self.register_buffer(name, torch.zeros(shape, dtype=dtype))
         self._stiffness = ReducedStiffness(self.stiffness, self.linear.terms)
-        self._law_of_samples = problem.material  # perhaps with ranges
+        self._kept: dict[torch.device, tuple[Tensors, Material, Tensor]] = {}
         self._last: tuple[Tensor, tuple[LawArguments, Array, Solve]] | None = None
-        self.register_buffer("dofs", problem.free.flatten().nonzero()[:, 0], persistent=False)
         self.register_buffer("prescribed", problem.prescribed, persistent=False)
 
     def _layout(
@@ -208,7 +208,7 @@ class Unrolled(StoredBuffers):
         return float(ratios.max()) if ratios.min() > LARGER else 1.0
 
     def _fields(self, force: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return displacements and the sizes of their corrections, (B, K + 2), see `Maps`."""
+        """Return displacements and the sizes of their corrections, (B, K + 2)."""
         if parameters is None:
             if names := list(self.scene.loads.parameter_ranges):
                 raise ValueError(f"parameters are an input of this model; give {names}, (B, P)")
@@ -216,24 +216,47 @@ class Unrolled(StoredBuffers):
         force, parameters = self.linear.dead_loads(force, parameters)
         if self._is_compiled(force, parameters):
             return self._compiled_fields(force, parameters)
-        loaded, law = force.flatten(1)[:, self.dofs], self.scene.problem.material
-        factors = self.linear.terms.factors(law.with_parameters(parameters))
-        linear = self._stiffness.solve(factors, loaded @ self.modes.to(loaded))  # Galerkin
-        matrices = [self.first_map.to(linear), *self.maps.to(linear)]
-        maps = Maps(SampleCells(self.gradients.to(linear)), matrices, self.limits)
-        coordinates, sizes = maps(self._law_of_samples.with_parameters(parameters), linear)
-        columns = self.linear(loaded, parameters) + coordinates @ self.modes.mT.to(coordinates)
-        fields = self.prescribed.flatten().to(columns).expand(columns.shape[0], -1)
-        return fields.index_copy(1, self.dofs, columns).unflatten(1, self.prescribed.shape), sizes
+        factors = self.linear.terms.factors(self.scene.problem.material.with_parameters(parameters))
+        parts, solved = self.linear.by_parity(force, parameters)  # (B, M, m)
+        model, of_samples, places = self._tensors(force.device)
+        right = model.modes.to(parts) @ parts.permute(1, 2, 0)
+        right = right.flatten(0, 1).index_select(0, places)
+        linear = self._stiffness.solve(factors, right.T)  # Galerkin
+        padded = pad(linear, (0, 1)).T.index_select(0, model.columns.flatten())
+        law = of_samples.with_parameters(parameters)
+        c, sizes = nonlinear_coordinates(model, law, padded.unflatten(0, model.columns.shape))
+        unit = largest(parts.flatten(1))  # over which float32 holds the displacements, (B, 1)
+        added = (model.modes.mT @ (c / unit.T).to(model.modes)).permute(2, 0, 1)
+        solved = solved + unit[..., None] * added
+        return (self.prescribed + self.linear.fields(solved)).to(force), sizes
 
     def _prepare(self) -> None:
-        """Prepare what follows from the buffers, and what a traced graph takes as constants."""
+        """Prepare what follows from the buffers."""
         parts = self.stiffness.detach().cpu().clone()
         self._stiffness = ReducedStiffness(parts, self.linear.terms)
-        self._law_of_samples = self.scene.problem.material.of_cells(self.cells.cpu()).centred()
         self._last = None
+        self._kept = {}
         for name in ("_doubt", "_arrays"):
             self.__dict__.pop(name, None)
+
+    def _tensors(self, device: torch.device) -> tuple[Tensors, Material, Tensor]:
+        """Return arrays as tensors, the law of their cells, and positions of the modes, (R,)."""
+        if device in self._kept:
+            return self._kept[device]
+        arrays, cells = self._arrays
+
+        def on_device(array: Any) -> Any:
+            return torch.from_numpy(array).to(device)
+
+        orbits = OrbitArrays(*map(on_device, arrays.orbits))
+        modes = arrays.modes.astype(self.linear.blocks.values.dtype)
+        model = ModelArrays(orbits, *map(on_device, arrays[1:]))._replace(modes=on_device(modes))
+        law = self.scene.problem.material.of_cells(self.cells.cpu()[cells]).centred()
+        places = on_device(arrays.columns.ravel().argsort()[: self.modes.shape[1]])
+        found = model, law, places
+        if not torch.compiler.is_compiling():  # tensors of a traced graph lack values
+            self._kept[device] = found
+        return found
 
     def _is_compiled(self, force: Tensor, parameters: Tensor) -> bool:
         """Return True if compiled loops can predict these loads: on the CPU, no derivatives."""
