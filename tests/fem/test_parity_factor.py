@@ -57,16 +57,20 @@ def test_entries_of_the_inverse_are_those_of_solutions(body):
         assert norm(found - exact) < 1e-5 * norm(exact)
 
 
-def test_a_body_without_reflections_has_one_factor():
+def test_a_body_without_reflections_has_one_parity():
     mesh = fem.box([4.0, 1.0, 1.0], [9, 3, 3])
     x, y, z = mesh.p
     crooked = type(mesh)(np.array([x, y + 0.1 * x**2, z + 0.2 * x]), mesh.t)
     solver = fem.LinearSolver(fem.Problem.build(crooked, NH, fixed=LEFT), linear="band")
-    assert isinstance(solver.float32_factor, BandedFactor)
+    right = np.random.default_rng(0).standard_normal(solver.problem.pattern.size)
+    factor, exact = solver.float32_factor, solver.factor.solve(right)
+    assert isinstance(factor, ParityFactor)
+    assert len(factor.orbits.characters) == 1
+    assert norm(factor.solve(right) - exact) < 1e-5 * norm(exact)
 
 
-def test_other_parameters_than_the_reference_have_one_factor():
-    """A factor for one load is not used often enough to pay for the factors by parity."""
+def test_other_parameters_than_the_reference_have_a_banded_factor():
+    """A factor for one load is not used often enough to pay for the condensed blocks."""
     law = fem.NeoHookeanLn([0.2, 0.4])
     problem = fem.Problem.build(fem.box([4.0, 1.0, 1.0], [9, 4, 4]), law, fixed=LEFT)
     solver = fem.LinearSolver(problem, linear="band")
