@@ -37,7 +37,7 @@ def relative_norm(residual: Tensor, loads: Sequence[Tensor]) -> tuple[Tensor, Te
 def norms(fields: Tensor) -> Tensor:
     """Return norms (B,) of fields (B, N, D) in float64 without under- or overflow of squares."""
     rows = fields.detach().flatten(1)
-    if rows.device.type == "cpu":
+    if rows.device.type == "cpu" and not torch.compiler.is_compiling():
         return torch.tensor([dnrm2(row) for row in rows.numpy()], dtype=torch.float64)
     unit = rows.abs().amax(dim=1)
     unit = torch.where(unit > 0, unit, 1.0)

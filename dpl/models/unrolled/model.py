@@ -92,6 +92,7 @@ class Unrolled(StoredBuffers):
             the factors are logarithms.
         least_sizes: Sizes that a tenth of the held-out samples do not reach, (K + 2,). Smaller ones
             count as these.
+        ratios: Measured over estimated errors of the first `FEW` loads of a stream, (`FEW`, 2).
         fitted: True after `fit`, ().
     """
 
@@ -109,6 +110,7 @@ class Unrolled(StoredBuffers):
     error_factors: Tensor
     error_exponents: Tensor
     least_sizes: Tensor
+    ratios: Tensor
     fitted: Tensor
     prescribed: Tensor
 
@@ -168,6 +170,7 @@ class Unrolled(StoredBuffers):
             "error_factors": ((2,), torch.float64),
             "error_exponents": ((2, 2 + maps), torch.float64),
             "least_sizes": ((2 + maps,), torch.float64),
+            "ratios": ((FEW, 2), torch.float64),
             "fitted": ((), torch.bool),
         }
 
@@ -194,18 +197,24 @@ class Unrolled(StoredBuffers):
 
     @cached_property
     def _doubt(self) -> float:
-        """Factor on stored errors that are far below the measured ones of a few random loads.
+        """Factor on stored errors that are further below measured ones than after the fit.
 
-        They are if a file is damaged. The measured error is the correction of K(0) in the rotated
-        frames of the nodes, which can be a hundred times too large on thin bodies, but not for all
-        loads.
+        They are if a file is damaged.
+        """
+        change = float((self._ratios() / self.ratios.clamp(min=1e-300)).max())
+        return 1.0 if change <= LARGER else change
+
+    def _ratios(self) -> Tensor:
+        """Return measured over stored errors of a few random loads, (`FEW`, 2).
+
+        The measured error is the correction of K(0) in the rotated frames of the nodes, which can
+        be a hundred times too large on thin bodies.
         """
         scene, load = self.scene, self.scene.loads.sample((0, SCALE_STREAM), range(FEW))
         fields, sizes = self._fields(load.force, load.parameters)
         pairs = zip(load.unbatch(), fields.split(1), strict=True)
         measured = [estimate_error(scene.linear, *pair, products=0).error for pair in pairs]
-        ratios = torch.tensor(measured) / self._stored_errors(sizes)[:, 0]
-        return float(ratios.max()) if ratios.min() > LARGER else 1.0
+        return torch.tensor(measured, dtype=torch.float64)[:, None] / self._stored_errors(sizes)
 
     def _fields(self, force: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return displacements and the sizes of their corrections, (B, K + 2)."""
@@ -341,6 +350,7 @@ class Unrolled(StoredBuffers):
         columns = zip(*(fit_errors(*pair) for pair in both), strict=True)
         self.error_factors, self.error_exponents = map(torch.stack, columns)
         self.least_sizes = sizes.quantile(SMALL, dim=0).clamp(min=1e-300)
+        self.ratios = self._ratios()
 
     def _of_dead_loads(self, samples: Sample) -> Sample:
         """Return samples whose nodal forces contain the follower loads at rest."""
@@ -387,7 +397,7 @@ class Unrolled(StoredBuffers):
         images = self.group.cell_images(problem)[:, cells.cpu()]
         if (cells.diff() <= 0).any() or not torch.isin(images, cells.cpu()).all():
             raise ValueError("cells must ascend and have all images under the symmetries")
-        for name in ("limits", "newton_weights", "least_sizes"):
+        for name in ("limits", "newton_weights", "least_sizes", "ratios"):
             if (getattr(self, name) < 0).any():
                 raise ValueError(f"{name} must be 0 or more")
         factors = self.linear.terms.factors(problem.reference.material)
