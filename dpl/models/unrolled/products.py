@@ -55,8 +55,7 @@ def _coordinates(model: Tensors, matrix: Tensor, signs: Tensor, found: Tensor) -
     """Return coordinates (M, r, B) of F features (B, C, F, 3, 3) at the sample cells."""
     characters = model.orbits.characters
     shape = found.shape[0], len(signs), -1, SIMD_WIDTH, found[0, 0].numel()
-    images = signs[..., None] * found.reshape(shape).permute(1, 2, 4, 3, 0).flatten(
-        1, 3
-    )  # (M, F b, B)
+    rows = found.reshape(shape).permute(1, 2, 4, 3, 0).flatten(1, 3)  # (M, F b, B)
+    images = signs[..., None] * rows
     parts: Tensor = characters @ images.flatten(1)
     return matrix.to(images) @ parts.view_as(images)
