@@ -154,6 +154,22 @@ def test_steps_in_the_modes_follow_while_the_estimated_error_is_large(scene, for
     assert without.error.isfinite().all()
 
 
+@pytest.mark.parametrize(("after", "method"), [(0.2, "corrected"), (0.5, "prediction")])
+def test_a_prediction_alone_is_corrected_where_steps_leave_less_than_a_third(
+    scene, forces, truth, after, method
+):
+    """The stated error of 0.1 % would suffice."""
+    near = lambda load: 1.001 * solution(scene, load)  # noqa: E731
+    sim = with_errors(
+        simulator_of(scene, near, newton=newton_everywhere(scene)), 1e-3, after * 1e-3
+    )
+    answer = sim(forces)
+    error = (answer.displacement - truth).flatten(1).norm(dim=1) / truth.flatten(1).norm(dim=1)
+    assert answer.method == [method] * 4
+    assert ((error < 5e-4) == (method == "corrected")).all()
+    assert sim(forces, error=2e-3).method == ["prediction"] * 4, "a wish that is met"
+
+
 def test_a_step_that_makes_an_answer_worse_is_not_taken(scene, forces, truth):
     wrong = simulator_of(scene, lambda load: 30 * torch.randn(load.force.shape).double())
     sim = Simulator(wrong.surrogate, newton=newton_everywhere(scene))

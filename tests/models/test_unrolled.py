@@ -22,7 +22,7 @@ from dpl.inference import Simulator
 from dpl.models import Unrolled
 from dpl.models.unrolled.correction import choose_newton, fit_errors
 from dpl.models.unrolled.features import unbalanced_stress
-from dpl.models.unrolled.fit import modes_of_parity
+from dpl.models.unrolled.fit import choose_cells, modes_of_parity
 from dpl.models.unrolled.regression import RIDGES, MapParities, fit_map
 from dpl.scene import Scene
 from dpl.training import MSE, Surrogate
@@ -68,6 +68,23 @@ def errors(net, samples):
     """Return relative errors (S,)."""
     difference = net(samples.force, samples.parameters) - samples.displacement
     return difference.flatten(1).norm(dim=1) / samples.displacement.flatten(1).norm(dim=1)
+
+
+@pytest.mark.parametrize("count", [1, 5, 12])
+def test_sample_cells_cover_the_body_as_evenly_as_they_lie_apart(beam, count):
+    """Gonzalez (1985); the centre of the body counts as one of the cells that are taken."""
+    problem = beam.problem
+    centres = problem.points[problem.cells].mean(dim=1)
+    cells = choose_cells(torch.arange(len(centres))[None], centres, count)
+    taken = torch.cat([centres.mean(dim=0)[None], centres[cells]])
+    apart = torch.cdist(taken, taken).fill_diagonal_(torch.inf).min()
+    assert len(cells) == count
+    assert torch.cdist(centres, taken).amin(dim=1).max() <= apart + 1e-12
+    images = SymmetryGroup.identity(problem).cell_images(problem)
+    images = torch.cat([images, beam.linear.symmetries.cell_images(problem)])
+    several = choose_cells(images, centres, count)
+    assert len(several) >= count
+    assert torch.isin(images[:, several], several).all(), "all images of a cell are taken"
 
 
 @pytest.mark.parametrize("name", BODIES)

@@ -132,8 +132,8 @@ def _chunks(samples: Sample) -> Iterator[Sample]:
 def choose_cells(images: Tensor, centres: Tensor, count: int) -> Tensor:
     """Return cells (C,) that cover the body evenly, with all their images.
 
-    Each further cell is the one farthest from those before and their images. C >= `count`, if there
-    are as many cells.
+    Each cell is the one farthest from the centre of the body and the cells before, with their
+    images. C >= `count`, if there are as many cells.
 
     Source: Gonzalez (1985), Clustering to minimize the maximum intercluster distance, Theor.
     Comput. Sci. 38.
@@ -143,7 +143,7 @@ def choose_cells(images: Tensor, centres: Tensor, count: int) -> Tensor:
         centres: Centres of the cells, (E, D).
         count: Wanted number of cells.
     """
-    distance = (centres - centres.mean(dim=0)).norm(dim=1)  # the first cell is an outer one
+    distance = (centres - centres.mean(dim=0)).norm(dim=1)
     taken = torch.zeros(len(centres), dtype=torch.bool)
     while int(taken.sum()) < min(count, len(centres)):
         orbit = images[:, distance.argmax()].unique()
