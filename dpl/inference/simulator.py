@@ -31,9 +31,7 @@ from dpl.training import TrainedSurrogate
 
 ERROR = 1e-3  # estimated relative error in the modes at which the steps end [-]
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
-WORTH = (
-    1 / 3
-)  # known error after steps in the modes over that before, below which they are made [-]
+WORTH = 1 / 3  # known error after steps over that before, below which they are made [-]
 MAX_RESIDUAL = 1.0  # above it the error outside of the modes is not that of the training [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 
@@ -330,8 +328,8 @@ class Simulator:
         pays = guess.error_outside < WORTH * guess.error and not request.is_more_than_prediction
         if in_range and guess.error <= enough and not pays:
             return first._replace(error=guess.error)
-        wanted = ERROR if request.error is None else request.error
-        wanted = guess.error_outside if pays else wanted
+        default = guess.error_outside if pays else ERROR
+        wanted = default if request.error is None else request.error
         begin = time.perf_counter()
         *_, state = self.newton.states(
             load, guess=guess.displacement, evaluation=first.state.evaluation, error_tol=wanted,

@@ -63,9 +63,8 @@ class Unrolled(StoredBuffers):
     commute with these, so that the answer has these symmetries exactly. The fit uses the images of
     the samples under the others. The answer has them nearly.
 
-    K(0)^-1 f is computed for every load by products with dense blocks, see `LinearResponse`.
-
-    The module takes and returns dimensionless float64 fields. It has no trained parameters.
+    K(0)^-1 f is computed for every load by products with dense blocks, see `LinearResponse`. The
+    module takes and returns dimensionless float64 fields. It has no trained parameters.
 
     Sources: Gregor, LeCun (2010), Learning fast approximations of sparse coding, ICML (unrolled
     iterations); Farhat, Avery, Chapman, Cortial (2014), Int. J. Numer. Methods Eng. 98
@@ -197,18 +196,14 @@ class Unrolled(StoredBuffers):
 
     @cached_property
     def _doubt(self) -> float:
-        """Factor on stored errors that are further below measured ones than after the fit.
-
-        They are if a file is damaged.
-        """
+        """Factor on stored errors, above 1 if measured ones exceed them by more than at the fit."""
         change = float((self._ratios() / self.ratios.clamp(min=1e-300)).max())
         return 1.0 if change <= LARGER else change
 
     def _ratios(self) -> Tensor:
         """Return measured over stored errors of a few random loads, (`FEW`, 2).
 
-        The measured error is the correction of K(0) in the rotated frames of the nodes, which can
-        be a hundred times too large on thin bodies.
+        The measured error is a corotational correction, a hundred times too large on thin bodies.
         """
         scene, load = self.scene, self.scene.loads.sample((0, SCALE_STREAM), range(FEW))
         fields, sizes = self._fields(load.force, load.parameters)
@@ -272,9 +267,8 @@ class Unrolled(StoredBuffers):
         tracing = torch.compiler.is_compiling() or torch.jit.is_tracing()
         if tracing or force.device.type != "cpu" or force.dtype != torch.float64:
             return False
-        differentiable = torch.is_grad_enabled() and (
-            force.requires_grad or parameters.requires_grad
-        )
+        wants_gradient = force.requires_grad or parameters.requires_grad
+        differentiable = torch.is_grad_enabled() and wants_gradient
         return self.is_fitted and not differentiable and self._has_loops
 
     def _compiled_fields(self, force: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
