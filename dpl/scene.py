@@ -181,8 +181,11 @@ class Scene:
         lattice = np.floor((points - points.min(axis=0)) * 1e9 + 0.3).astype(np.int64)
         loads = problem.follower_loads.identity()
         functions = problem.volume_functions
-        if problem.follower_loads.ranges:  # parameters of samples are in Pa
+        units = {*problem.follower_loads.units.values()}  # parameters of samples are in SI units
+        if units:
             loads["young"] = problem.young
+        if units - {"Pa"}:
+            loads["length"] = problem.length
         return {
             "points": sha256_of(lattice),
             "cells": plain(problem.cells),
@@ -220,8 +223,9 @@ class Scene:
         springs = "" if problem.springs is None else ", an elastic foundation"
         for part in problem.follower_loads.parts:
             springs += f", {part.describe()}"
-        for name, (low, high) in problem.follower_loads.ranges.items():
-            springs += f", {name} from {low:.4g} to {high:.4g} Pa"
+        for name, unit in problem.follower_loads.units.items():
+            low, high = problem.follower_loads.ranges[name]
+            springs += f", {name} from {low:.4g} to {high:.4g} {unit}"
         # constants of the law in the centre of their ranges; magnitudes of nodal forces are added
         load = loads.sample((0, DESCRIPTION_STREAM), range(FEW))
         force = load.force.norm(dim=2).sum(dim=1) * load.young * self.force_unit

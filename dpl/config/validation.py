@@ -71,6 +71,7 @@ EXPECTED_TYPES = {  # base classes of the object that the call under a key retur
         "dpl.fem.loads.forces.BodyForce",
         "dpl.fem.assembly.follower_pressure.FollowerPressure",
         "dpl.fem.assembly.active_stress.ActiveStress",
+        "dpl.fem.assembly.follower_cable.FollowerCable",
     },
     "solver": {"dpl.fem.solvers.linear.ReferenceSolver"},
     "loads": {"dpl.fem.loads.family.LoadFamily"},

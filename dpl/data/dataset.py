@@ -103,9 +103,10 @@ class DataSet:
         problem, constant = self.scene.problem, self.scene.loads.constant_force
         fixed = constant is not None or problem.has_one_modulus or problem.moved_supports
         same = " with these boundary values over E and L" if fixed else ""
-        sizes = "size" if problem.follower_loads.ranges else "size and Young's modulus"
+        units = {*problem.follower_loads.units.values()}  # of parameters
+        sizes = "" if units - {"Pa"} else " for every size" + " and Young's modulus" * (not units)
         lines = [
-            f"one data set for every {sizes} of this body{same}: "
+            f"one data set{sizes} of this body{same}: "
             f"{self.store.folder}, of scene {self.scene.fingerprint[:12]}"
         ]
         if there:

@@ -116,8 +116,8 @@ def _model(scene: Scene, path: Path, force_unit: str) -> dict[str, Any]:
     stored = onnx.load(str(path), load_external_data=False)
     problem, loads, young = scene.problem, scene.loads, scene.loads.moduli[1]
     units = problem.material.units_of_ranges.items()
-    pascals = {name for name, unit in units if unit and math.isclose(unit * young, 1)}
-    pascals.update(problem.follower_loads.ranges)
+    units_of = {name: "Pa" for name, unit in units if unit and math.isclose(unit * young, 1)}
+    units_of |= problem.follower_loads.units
     field = ["B", *problem.shape]
     known: dict[str, dict[str, Any]] = {
         "force": {"shape": field, "unit": force_unit},
@@ -129,7 +129,7 @@ def _model(scene: Scene, path: Path, force_unit: str) -> dict[str, Any]:
         },
         "parameters": {
             "shape": ["B", len(loads.parameter_ranges)],
-            "unit": ["Pa" if name in pascals else "1" for name in loads.parameter_ranges],
+            "unit": [units_of.get(name, "1") for name in loads.parameter_ranges],
             "ranges": loads.parameter_ranges,
         },
         "displacement": {"shape": field, "unit": "m"},

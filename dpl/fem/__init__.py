@@ -7,6 +7,7 @@ from dpl.system.lazy import public_names
 if TYPE_CHECKING:
     from dpl.fem.assembly.active_stress import ActiveStress
     from dpl.fem.assembly.boundary_conditions import DirichletBC, RobinBC
+    from dpl.fem.assembly.follower_cable import FollowerCable
     from dpl.fem.assembly.follower_pressure import FollowerPressure
     from dpl.fem.linear.backends import installed_backends
     from dpl.fem.linear.interface import SingularMatrix

@@ -90,9 +90,11 @@ class Problem:
         prescribed: Displacement of the fixed ones at full load, (N, D) [-]; zero where free.
         boundary: Mask of the nodes on the boundary, (N,).
         springs: Elastic foundation (Robin conditions), or None.
-        follower_loads: Loads whose forces depend on the displacement: pressures, active stress.
+        follower_loads: Loads whose forces depend on the displacement: pressures, active stress,
+            cables.
         volume_functions: Functions of the volume change in the cells, (E or 1, Q, M), see
             `CellVolumes`; None without mean dilatation.
+        links: Pairs of nodes that follower loads join beyond the cells, (K, 2).
         young: Young's modulus by which boundary values are divided [Pa]; None if there is no such
             modulus, see `dpl.fem.units.Units`. No other quantity depends on it.
         discretisation: What is computed from mesh and supports; a new one is made unless the given
@@ -114,6 +116,7 @@ class Problem:
     springs: FoundationMatrix | None = None
     follower_loads: FollowerLoads = NO_LOADS
     volume_functions: Tensor | None = None
+    links: Tensor = NO_LOADS.links
     young: float | None = 1.0
     discretisation: Discretisation = field(default=None, repr=False)  # type: ignore[assignment]
 
@@ -155,8 +158,8 @@ class Problem:
                 if left out.
             supports: Further prescribed displacements [m] and elastic foundations [N/m^3]; the last
                 displacement on a degree of freedom counts.
-            follower_loads: Follower pressures and active stresses [Pa], which add up; values or
-                ranges.
+            follower_loads: Follower pressures and active stresses [Pa] and tensions of cables [N],
+                which add up; values or ranges.
             degree: Degree of the displacement, 1 or 2.
             mean_dilatation: Project the volume ratio in each cell, so that nearly incompressible
                 bodies do not lock, see `CellVolumes`. Triangles and tetrahedra need degree 2.
@@ -193,6 +196,7 @@ class Problem:
         nu = material.largest_poisson_ratio
         for line in locking_warnings(mesh, degree, nu, mean_dilatation=mean_dilatation):
             warnings.warn(line, stacklevel=2)
+        loads = FollowerLoads.build(follower_loads, basis, units, material, origin)
         return cls(
             **parts,
             material=material,
@@ -201,7 +205,8 @@ class Problem:
             free=torch.from_numpy(np.isnan(given)),
             prescribed=torch.from_numpy(np.nan_to_num(given)),
             springs=springs,
-            follower_loads=FollowerLoads.build(follower_loads, basis, units, material, origin),
+            follower_loads=loads,
+            links=loads.links,
             young=young,
         )
 
@@ -429,8 +434,8 @@ class Problem:
     def has_potential(self) -> bool:
         """True if the tangent is symmetric under the follower loads, whatever their values.
 
-        The stiffness of a follower load is at most linear in u, so that one random displacement
-        decides.
+        The stiffness of a follower load is symmetric or at most linear in u, so that one random
+        displacement decides.
         """
         random = torch.Generator().manual_seed(0)
         noise = torch.rand(1, *self.shape, generator=random, dtype=torch.float64) - 0.5
@@ -451,7 +456,7 @@ class Problem:
     def parameter_ranges(self) -> dict[str, ParameterRange]:
         """Ranges of what differs between loads beside forces and Young's modulus, by name.
 
-        They are the ranges of the law [-], then those of follower loads [Pa].
+        They are the ranges of the law [-], then those of follower loads [Pa or N].
         """
         return {**self.material.parameter_ranges, **self.follower_loads.ranges}
 

@@ -64,7 +64,8 @@ class Controls:
         self.mode = gui.add_dropdown("drag", (PULL, GRASP))
         self.axis = gui.add_dropdown("rotation axis", tuple(AXES), initial_value="y")
         self.angle = gui.add_slider("rotation [°]", -90.0, 90.0, 1.0, 0.0, marks=(-90, 0, 90))
-        labels = {name: f"{name} [Pa]" for name in scene.problem.follower_loads.ranges} | LABELS
+        units = scene.problem.follower_loads.units.items()
+        labels = {name: f"{name} [{unit}]" for name, unit in units} | LABELS
         self.parameters = {
             name: gui.add_slider(
                 labels.get(name, name), *ends, round_step(*ends), body.parameters[name]

@@ -94,6 +94,7 @@ def test_a_range_of_one_modulus_is_that_modulus(scene_of):
 INFLATE = f"+forces.inflate={{_target_: dpl.fem.FollowerPressure, value: 45.0, {END}}}"
 FIBRES = "directions: {_target_: dpl.fem.ConstantFibres, fibre: [1.0, 0.0, 0.0]}"
 MUSCLE = f"+forces.muscle={{_target_: dpl.fem.ActiveStress, value: 45.0, {FIBRES}}}"
+TENDON = "+forces.tendon={_target_: dpl.fem.FollowerCable, value: 45.0, points: [[0,5,5],[9,5,5]]}"
 OUTSIDE = "region: {_target_: dpl.fem.Box, lower: [500, 0, 0], upper: [501, 1, 1]}"
 BAD = {
     (PULL, "young=[1e3,2e3]"): r"forces\.pull: value = \[45\.0, 0, 0\] must be divided by one "
@@ -120,6 +121,9 @@ BAD = {
     (INFLATE.replace("45.0", ".inf"),): r"forces\.inflate.value",
     (INFLATE.replace("45.0", "true"),): r"forces\.inflate.value",
     (INFLATE.replace("at: max", "at: 7.0"),): r"forces\.inflate: .*holds no facet",
+    (TENDON, "young=[1e3,2e3]"): r"forces\.tendon: value = 45.0 .*young is a range",
+    (TENDON.replace(",[9,5,5]", ""),): r"forces\.tendon: points = .* must be two or more points",
+    (TENDON.replace("9,", "900,"),): r"forces\.tendon: the point \[900.*must lie in the body",
     (MUSCLE.replace(f", {FIBRES}", ""),): r"forces\.muscle: no fibre directions are known",
     (MUSCLE.replace("45.0", "[2.0, 1.0]"),): r"forces\.muscle: value.* low below high",
     (MUSCLE.replace("45.0", "[1.0, 2.0, 3.0]"),): r"forces\.muscle: value.* along the fibres",

@@ -35,10 +35,17 @@ KINDS = ["closed pressure", "open pressure", "active stress"]
 ELEMENTS = list(product(("triangle", "quad", "tetra", "hexahedron"), (1, 2)))
 BENT = [(KINDS[number % 3], element) for number, element in enumerate(ELEMENTS)]
 BENT += [(KINDS[(number + 1) % 3], element) for number, element in enumerate(ELEMENTS[2:6])]
+BENT += [("cable", element) for element in ELEMENTS]
 
 
 def first_half(points):
     return points[:, 0] < 0.5
+
+
+def cable(value, dim=3):
+    """Return a cable with a kink, whose ends lie in cells that have no common node."""
+    points = [[0.1, 0.2, 0.3], [0.5, 0.7, 0.6], [0.9, 0.3, 0.7]]
+    return fem.FollowerCable([point[:dim] for point in points], value)
 
 
 def solved(newton):
@@ -63,6 +70,7 @@ def bent(request, grid, bend):
             fem.ActiveStress(0.3, directions=fem.FibreFunction(swirl)),
             fem.ActiveStress(0.2, region=first_half, directions=OBLIQUE),
         ],
+        "cable": [cable(0.3, mesh.dim()), fem.FollowerCable(mesh.p.T[[0, -1]].tolist(), 0.1)],
     }[name]
     fixed = None if name == "closed pressure" else START
     problem = fem.Problem.build(
@@ -84,7 +92,7 @@ def test_tangent_is_the_derivative_of_the_force(bent):
     """By central differences, to 1e-7; symmetric and skew part, by compiled loops and tensors."""
     _, problem, u = bent
     v = torch.from_numpy(np.random.default_rng(2).normal(size=u.shape)) * problem.free
-    step, loads = 1e-4, problem.follower_loads
+    step, loads = 1e-5, problem.follower_loads
     slope = (loads.force(u + step * v) - loads.force(u - step * v)) / (2 * step)
     system = problem.linearise(u)
     elastic = replace(problem, follower_loads=NO_LOADS).linearise(u)
@@ -99,7 +107,7 @@ def test_tangent_is_the_derivative_of_the_force(bent):
 
 
 def test_forces_on_a_body_in_equilibrium_have_no_resultant(bent):
-    """A closed surface and a stress have neither force nor moment."""
+    """A closed surface, a stress and a cable have neither force nor moment."""
     name, problem, u = bent
     force = problem.follower_loads.force(u)[0]
     x, size = problem.points + u[0], force.abs().sum()
@@ -278,6 +286,8 @@ def test_gradients_of_solutions_agree_with_differences(beam, load):
         (fem.FollowerPressure(END, 0.1), 8),
         (fem.ActiveStress(0.1, directions=ALONG_X), 8),
         (fem.ActiveStress(0.1, directions=fem.ConstantFibres([1.0, 1.0, 0.0])), 2),
+        (fem.FollowerCable([[0.0, 0.5, 0.5], [1.0, 0.5, 0.5]], 0.1), 8),
+        (fem.FollowerCable([[0.0, 0.5, 0.2], [1.0, 0.5, 0.2]], 0.1), 2),
     ],
 )
 def test_follower_loads_count_for_symmetries(grid, load, count):
@@ -320,6 +330,12 @@ def test_directions_are_those_of_the_law_unless_given(grid):
         (replace(MUSCLE, value=[1.0, 0.0, 0.0]), r"value = .* along the fibres"),
         (replace(MUSCLE, region=fem.Box([5, 5, 5], [6, 6, 6])), "holds no cell"),
         (replace(MUSCLE, directions=fem.ConstantFibres([1.0, 0.0])), "must have 3 components"),
+        (replace(cable(0.1), value=[1.0, 0.0, 0.0]), r"value = .* along the cable"),
+        (replace(cable(0.1), value=True), r"value = True must be a finite number or .*\[N\]"),
+        (replace(cable(0.1), points=[[0, 0, 0]]), "points = .* must be two or more points of 3"),
+        (cable(0.1, 2), "points = .* must be two or more points of 3"),
+        (replace(cable(0.1), points=[[0, 0, 0]] * 2), "must not contain the same point twice in"),
+        (replace(cable(0.1), points=[[0, 0, 0], [1, 1, 9]]), "point .1.0, 1.0, 9.0. .m. must lie"),
     ],
 )
 def test_invalid_loads_are_refused_in_one_line(load, message, grid):
@@ -405,6 +421,39 @@ def test_a_rotated_body_with_rotated_fibres_and_load_has_the_rotated_solution():
     usual, turned = answer(np.eye(3)), answer(Q)
     assert usual.abs().max() > 0.02
     assert_close(turned, usual @ torch.from_numpy(Q.T), rtol=0, atol=1e-9)
+
+
+def strip(tension, points):
+    """Return a clamped strip of 20 x 1 in plane strain with a cable, and Newton's solution."""
+    mesh = fem.rectangle([20.0, 1.0], [21, 3], "quad")
+    pull = fem.FollowerCable(points, tension)
+    problem = fem.Problem.build(mesh, NH, fixed=START, degree=2, follower_loads=[pull], length=1.0)
+    return problem, solved(fem.Newton(problem))
+
+
+PLANE_MODULUS = 1 / (1 - NH.poisson**2)  # E / (1 - nu^2), the modulus of bending in plane strain
+
+
+@pytest.mark.parametrize(("ratio", "is_stable"), [(0.97, True), (1.03, False)])
+def test_a_cable_from_the_end_to_the_support_buckles_a_column_at_pi_squared(ratio, is_stable):
+    """A load through a fixed point of the support: 4 times Euler's load of the cantilever.
+
+    Source: Timoshenko, Gere (1961), Theory of Elastic Stability, section 2.5.
+    """
+    critical = math.pi**2 * PLANE_MODULUS / 12 / 20**2
+    _, found = strip(ratio * critical, [[0.0, 0.5], [20.0, 0.5]])
+    assert found.converged.all()
+    assert (int(found.negative_pivots) == 0) == is_stable
+
+
+@pytest.mark.parametrize("angle", [0.1, 1.0])
+def test_a_guided_cable_bends_a_beam_to_an_arc(angle):
+    """T e = E' I kappa, for any rotation, where each section guides the cable at the height e."""
+    tension = angle * PLANE_MODULUS / 12 / (20 * 0.4)
+    problem, found = strip(tension, [[float(x), 0.9] for x in range(21)])
+    x = (problem.points + found.displacement[0])[problem.points[:, 0] == 20.0]
+    across = x[x[:, 1].argmax()] - x[x[:, 1].argmin()]
+    assert float(torch.atan2(-across[0], across[1])) == pytest.approx(angle, rel=0.01)
 
 
 def test_pressure_beyond_the_limit_point_has_no_valid_equilibrium():

@@ -256,7 +256,7 @@ KINDS = {
         "DirichletBC",
         "RobinBC",
     ),
-    *("Traction", "BodyForce", "FollowerPressure", "ActiveStress", "Loss"),
+    *("Traction", "BodyForce", "FollowerPressure", "ActiveStress", "FollowerCable", "Loss"),
     *("CellField", "FibreEnergy", "FibreDirections", "ReferenceSolver"),
 }
 WATCHING = {"Trainer", "Callback", "Logger", "CheckpointIO"}

@@ -94,7 +94,7 @@ class ActiveFibres(LoadedPart):
     """
 
     kind: ClassVar[str] = "active stress"
-    key: ClassVar[str] = "active_stress"
+    key = "active_stress"
     extent: ClassVar[str] = "in {:,} cells"
     cells: Tensor
     fibre: Tensor

@@ -68,6 +68,7 @@ class Discretisation:
     free: Tensor
     boundary: Tensor
     volume_functions: Tensor | None
+    links: Tensor
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields without cached properties."""
@@ -104,7 +105,7 @@ class Discretisation:
     @cached_property
     def pattern(self) -> Pattern:
         """Sparsity pattern of the tangent."""
-        return Pattern.build(self.cells.cpu().numpy(), self.free.cpu().numpy())
+        return Pattern.build(*(part.cpu().numpy() for part in (self.cells, self.links, self.free)))
 
     @cached_property
     def recovery(self) -> Recovery:

@@ -1,4 +1,4 @@
-"""Follower loads: stresses of the surroundings or of muscle, whose forces follow the deformation.
+"""Follower loads: pressures, tension of muscle and cables, whose forces follow the deformation.
 
 Their nodal forces depend on the displacement and are a part of the internal force of a body.
 """
@@ -29,20 +29,21 @@ ASYMMETRIC = 1e-10  # part of the largest entry above which a skew part is no ro
 
 
 class FollowerLoad:
-    """Specification of a follower load: a stress on a part of a body.
+    """Specification of a follower load: a stress on a part of a body, or the tension of a cable.
 
     Attributes:
-        value: The stress [Pa]; or a range [low, high] or {low, high, distribution}.
+        value: The stress [Pa] or tension [N]; or a range [low, high] or {low, high, distribution}.
         name: Name of the parameter of a range; `default_name` if left out.
     """
 
     default_name: ClassVar[str]
     direction_hint: ClassVar[str]  # says why `value` is no vector
+    unit: ClassVar[str] = "Pa"  # of `value`
     value: Stress
     name: str | None
 
     def stress(self, units: Units) -> tuple[float, ParameterRange | None]:
-        """Return the stress over E [-], and None; NaN and its range [Pa] if loads decide it."""
+        """Return the value over E, and None; NaN and its range [Pa or N] if loads decide it."""
         value, ends = self.value, None
         if is_range(value):
             try:
@@ -51,14 +52,14 @@ class FollowerLoad:
                 raise ValueError(f"{error}; {self.direction_hint}") from error
             value = ends[0]
         if isinstance(value, bool) or not (isinstance(value, int | float) and math.isfinite(value)):
-            raise ValueError(f"value = {value} must be a finite number or a range [Pa]")
+            raise ValueError(f"value = {value} must be a finite number or a range [{self.unit}]")
         stress = float(units.stress(np.array(value, dtype=np.float64), f"value = {self.value}"))
         return (math.nan if ends else stress), ends
 
     def on(
         self, basis: skfem.Basis, units: Units, material: Material, origin: Origin = 0.0
     ) -> "LoadedPart":
-        """Return the loaded facets or cells of a body, whose law is that after `Material.on`.
+        """Return the loaded part of a body, whose law is that after `Material.on`.
 
         The coordinates of the scalar basis are those from `origin` (D,), divided by L.
         """
@@ -67,15 +68,14 @@ class FollowerLoad:
 
 @dataclass(frozen=True, eq=False)
 class LoadedPart:
-    """Facets or cells under a follower load: nodal forces, work and stiffness of a stress of E.
+    """Facets, cells or segments under a follower load: forces, work and stiffness of a unit value.
 
     Attributes:
-        nodes: Nodes of each loaded facet or cell, (S, A).
+        nodes: Nodes of each facet, cell or segment, (S, A).
     """
 
     kind: ClassVar[str]  # name in messages
-    key: ClassVar[str]  # name in the identity of a scene
-    extent: ClassVar[str]  # of a number of facets or cells, in words
+    extent: ClassVar[str]  # of a number of facets, cells or segments, in words
     nodes: Tensor
 
     def to(self, device: torch.device | str) -> Self:
@@ -87,9 +87,29 @@ class LoadedPart:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @property
+    def key(self) -> str:
+        """Name in the identity of a scene."""
+        raise NotImplementedError
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the value."""
+        return "Pa"
+
+    @property
+    def scale(self) -> float:
+        """Dimensionless value of the value E [SI units]."""
+        return 1.0
+
+    @property
     def directions(self) -> Tensor | None:
         """Directions that belong to the identity of the load; None for a pressure."""
         return None
+
+    @property
+    def links(self) -> Tensor:
+        """Pairs of nodes in `stiffness` that belong to no common cell, (K, 2)."""
+        return self.nodes.new_zeros(0, 2)
 
     def force(self, displacement: Tensor) -> Tensor:
         """Return the part of the internal force, minus the nodal forces, (B, N, D) [-]."""
@@ -110,8 +130,12 @@ class LoadedPart:
         raise NotImplementedError
 
     def places(self, pattern: Pattern) -> NDArray[Any]:
-        """Return the positions of the entries on a pattern, (M,); nnz for those not stored."""
-        raise NotImplementedError
+        """Return the positions of the entries on a pattern, (M,); nnz for those not stored.
+
+        By default they are those of all pairs of degrees of freedom (a, i) of a facet or segment.
+        """
+        numbers = pattern.number[self.nodes.cpu().numpy()].reshape(len(self.nodes), -1)
+        return pattern.positions(numbers[:, :, None], numbers[:, None, :]).ravel()
 
     def places_on(self, pattern: Pattern) -> Tensor:
         """Return `places`, computed once for each pattern."""
@@ -137,13 +161,14 @@ class LoadedPart:
 class FollowerLoads:
     """All follower loads of a body; False in a condition if there are none.
 
-    Forces, work and stiffness are linear in the stresses.
+    Forces, work and stiffness are linear in the values.
 
     Attributes:
         parts: One for each load.
-        values: Stress over E of each load, (1, P) [-], or (B, P) for each member of a batch; NaN
-            for a range.
-        ranges: Smallest and largest stress [Pa] of each load that differs between samples, by name.
+        values: Stress over E, or tension over E L^(D - 1), of each load, (1, P) [-], or (B, P) for
+            each member of a batch; NaN for a range.
+        ranges: Smallest and largest stress [Pa] or tension [N] of each load that differs between
+            samples, by name.
     """
 
     parts: tuple[LoadedPart, ...] = ()
@@ -168,8 +193,8 @@ class FollowerLoads:
                 stress, ends = load.stress(units)
                 if ends and name in (*ranges, *material.parameter_ranges):
                     raise ValueError(f"two ranges have the name {name}; set another")
-                values.append(stress)
                 parts.append(load.on(basis, units, material, origin))
+                values.append(stress * parts[-1].scale)
             if ends:
                 ranges[name] = ends
         return cls(tuple(parts), torch.tensor([values], dtype=torch.float64), ranges)
@@ -182,6 +207,16 @@ class FollowerLoads:
     def kinds(self) -> str:
         """Kinds of the loads in words."""
         return " and ".join(dict.fromkeys(part.kind for part in self.parts))
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each range, by name."""
+        return dict(zip(self.ranges, (part.unit for part in self._ranged_parts), strict=True))
+
+    @property
+    def links(self) -> Tensor:
+        """Pairs of nodes that the loads join beyond the cells, (K, 2)."""
+        return torch.cat([torch.zeros(0, 2, dtype=torch.int64), *(p.links for p in self.parts)])
 
     def to(self, device: torch.device | str) -> Self:
         """Return the loads with their tensors on a device."""
@@ -213,10 +248,17 @@ class FollowerLoads:
         """Mask of the loads with a range, (P,)."""
         return self.values[0].isnan()
 
+    @property
+    def _ranged_parts(self) -> list[LoadedPart]:
+        """Parts of the loads with a range."""
+        pairs = zip(self.parts, self._ranged.tolist(), strict=True)
+        return [part for part, is_ranged in pairs if is_ranged]
+
     def with_values(self, values: Tensor) -> Self:
-        """Return the loads with stresses over E in place of the ranges, (1, R) or (B, R) [-]."""
-        every = self.values.expand(len(values), -1)
-        return type(self)(self.parts, every.index_copy(1, self._ranged.nonzero()[:, 0], values))
+        """Return the loads with values over E [SI units] in place of the ranges, (1 or B, R)."""
+        every, numbers = self.values.expand(len(values), -1), self._ranged.nonzero()[:, 0]
+        values = values * values.new_tensor([part.scale for part in self._ranged_parts])
+        return type(self)(self.parts, every.index_copy(1, numbers, values))
 
     @property
     def constant(self) -> Self:
@@ -240,13 +282,12 @@ class FollowerLoads:
         return self._weighted(works, displacement.new_zeros(len(displacement)))
 
     def unit_forces(self, displacement: Tensor) -> Tensor:
-        """Return `force` at (1, N, D) of each load with a range at a stress of E, (R, N, D) [-]."""
-        pairs = zip(self.parts, self._ranged, strict=True)
-        forces = [part.force(displacement) for part, ranged in pairs if ranged]
+        """Return `force` at (1, N, D) of each range for the value E [SI units], (R, N, D) [-]."""
+        forces = [part.scale * part.force(displacement) for part in self._ranged_parts]
         return torch.cat(forces) if forces else displacement[:0]
 
     def _weighted(self, terms: Iterable[Tensor], total: Tensor) -> Tensor:
-        """Return a total plus the terms of all loads for a stress of E, times their stresses."""
+        """Return a total plus the terms of all loads for a unit value, times their values."""
         for value, term in zip(self.values.unbind(1), terms, strict=True):
             total = total + value.reshape(-1, *(1,) * (term.ndim - 1)) * term
         return total

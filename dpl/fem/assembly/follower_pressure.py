@@ -12,7 +12,6 @@ from torch import Tensor
 
 from dpl.fem.assembly.elements import QUADRATIC
 from dpl.fem.assembly.follower_loads import FollowerLoad, LoadedPart, Stress
-from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin, Region, facets_in
 from dpl.fem.units import Units
@@ -70,7 +69,7 @@ class PressureSurface(LoadedPart):
     """
 
     kind: ClassVar[str] = "follower pressure"
-    key: ClassVar[str] = "pressure"
+    key = "pressure"
     extent: ClassVar[str] = "on {:,} facets"
     weights: Tensor
     slopes: Tensor
@@ -140,11 +139,6 @@ class PressureSurface(LoadedPart):
         weights, slopes = self.weights.mT[:, :, None], self.slopes.permute(3, 0, 2, 1)
         first, second = (weights * slopes[:, :, None]).flatten(2, 3)
         return first, second
-
-    def places(self, pattern: Pattern) -> NDArray[np.int64]:
-        """Return the positions of the entries on a pattern, (S (A D)^2,)."""
-        numbers = pattern.number[self.nodes.cpu().numpy()].reshape(len(self.nodes), -1)
-        return pattern.positions(numbers[:, :, None], numbers[:, None, :]).ravel()
 
     def _slopes(self, displacement: Tensor) -> Tensor:
         """Return du/dxi_i at the quadrature points, (B, S, Q, 3, 2) [-]; in 2D with zeros."""

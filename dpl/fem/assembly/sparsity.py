@@ -1,4 +1,4 @@
-"""Sparsity pattern of the tangent, built once per body from its cells and free nodes."""
+"""Sparsity pattern of the tangent, built once per body from its cells, links and free nodes."""
 
 from dataclasses import dataclass
 
@@ -29,13 +29,16 @@ class Pattern:
     number: Integers
 
     @classmethod
-    def build(cls, cells: Integers, free: NDArray[np.bool_]) -> "Pattern":
-        """Return the pattern of cells (E, A) with a mask of free degrees of freedom (N, D)."""
+    def build(cls, cells: Integers, links: Integers, free: NDArray[np.bool_]) -> "Pattern":
+        """Return the pattern of cells (E, A) and further pairs of nodes (K, 2).
+
+        `free` is the mask of the free degrees of freedom, (N, D).
+        """
         nodes, size = len(free), int(free.sum())
         number = np.full(free.shape, -1)
         number[free] = np.arange(size)
         b, a = np.tril_indices(cells.shape[1])
-        p, q = cells[:, a], cells[:, b]
+        p, q = (np.append(cells[:, one], links[:, k]) for k, one in enumerate((a, b)))
         codes, entry = np.unique(np.minimum(p, q) * nodes + np.maximum(p, q), return_inverse=True)
         low, high = number[codes // nodes], number[codes % nodes]
         row, column = np.broadcast_arrays(low[:, :, None], high[:, None, :])  # (pairs, D, D)
@@ -48,9 +51,10 @@ class Pattern:
         order[matrix.data] = np.arange(nnz)
         place = np.full(stored.shape, nnz, dtype=np.int32)
         place[stored] = order
-        places = place[entry.reshape(p.shape)]
+        places = place[entry]
         transposed = (p > q)[..., None, None]
         places = np.where(transposed, places.swapaxes(-1, -2), places)
+        places = places[: cells.shape[0] * len(a)].reshape(len(cells), len(a), *places.shape[1:])
         indptr, indices = (part.astype(np.int32) for part in (matrix.indptr, matrix.indices))
         return cls(size, indptr, indices, places, number)
 
@@ -69,7 +73,7 @@ class Pattern:
         return Pattern(len(dofs), indptr, column, places, number[self.number]), dofs
 
     def positions(self, row: Integers, column: Integers) -> Integers:
-        """Return the positions of entries of pairs of degrees of freedom that belong to one cell.
+        """Return the positions of entries of pairs of degrees of freedom of one cell or link.
 
         The result is nnz for pairs below the diagonal and for fixed ones, whose number is -1.
         """

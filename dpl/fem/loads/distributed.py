@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.fem.assembly.follower_cable import CableSegments
+from dpl.fem.assembly.follower_loads import LoadedPart
 from dpl.fem.assembly.follower_pressure import PressureSurface
 from dpl.fem.loads.family import SurfaceLoads
 from dpl.fem.loads.forces import ROUNDOFF, body_force, facet_areas
@@ -17,8 +19,6 @@ from dpl.fem.loads.sized import CombinedLoads, VectorLoads, rounded
 from dpl.fem.options import option
 from dpl.fem.problem import Problem
 from dpl.system.checks import named_errors
-
-INWARD = 1e-7  # shift of points on the surface into their cell, over the distance to its centre [-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +51,7 @@ class FacePressure(SurfaceLoads, CombinedLoads):
     @cached_property
     def shapes(self) -> Tensor:
         """Force of the pressure 1 on the undeformed surface, (1, N, D) [-]."""
-        surface = PressureSurface.build(self.problem.basis, self.facets)
-        force = -surface.force(torch.zeros(1, *self.problem.shape, dtype=torch.float64))
-        return torch.where(force.abs() > ROUNDOFF * force.abs().max(), force, 0.0)
+        return _at_rest(PressureSurface.build(self.problem.basis, self.facets), self.problem)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,50 +107,22 @@ class CableLoads(CombinedLoads):
         """Force of the tension 1 in each cable, (K, N, D) [-]."""
         if not self.cables:
             raise ValueError("cables = [] must contain a cable: a list of points [m]")
-        shapes = []
-        for number in range(len(self.cables)):
-            points = self._points(number)
-            step = np.diff(points, axis=0)
-            length = np.linalg.norm(step, axis=1, keepdims=True)
-            if not (length > 0).all():
-                raise ValueError(f"cables.{number} must not contain the same point twice in a row")
-            pulls = np.diff(step / length, axis=0, prepend=0.0, append=0.0)
+        shapes, problem = [], self.problem
+        for number, cable in enumerate(self.cables):
             with named_errors(f"cables.{number}: "):
-                shapes.append(torch.from_numpy(shape_functions(self.problem, points).T @ pulls))
-        return torch.stack(shapes)
-
-    def _points(self, number: int) -> Array:
-        """Return the points of a cable over L, (P, D)."""
-        cable, dim = self.cables[number], self.problem.shape[1]
-        sound = len(cable) >= 2 and all(len(point) == dim for point in cable)
-        if not (sound and np.isfinite(cable).all()):
-            raise ValueError(
-                f"cables.{number} = {list(map(list, cable))} must be two or more points of {dim} "
-                "coordinates [m]"
-            )
-        return np.asarray(cable, dtype=np.float64) / self.problem.length - self.problem.origin
+                place = problem.length, problem.origin
+                shapes.append(_at_rest(CableSegments.build(problem.basis, cable, *place), problem))
+        return torch.cat(shapes)
 
     def identity(self) -> dict[str, Any]:
         """Return the options; the cables are identified by their points over L."""
-        corner = self.problem.points.numpy().min(axis=0)
-        points = [np.round(self._points(k) - corner, 9) + 0.0 for k in range(len(self.cables))]
+        corner = self.problem.origin + self.problem.points.numpy().min(axis=0)
+        cables = [np.array(cable) / self.problem.length - corner for cable in self.cables]
+        points = [np.round(cable, 9) + 0.0 for cable in cables]
         return super().identity() | {"cables": [[rounded(p) for p in cable] for cable in points]}
 
 
-def shape_functions(problem: Problem, points: Array) -> Array:
-    """Return the values of all shape functions at points (P, D) [-] of the body, (P, N)."""
-    basis, mesh = problem.basis, problem.mesh
-    centres = mesh.p[:, mesh.t].mean(axis=1).T  # (cells, D)
-    values = np.zeros((len(points), basis.N))
-    for row, point in zip(values, points, strict=True):
-        centre = centres[np.linalg.norm(centres - point, axis=1).argmin()]
-        inward = point + INWARD * (centre - point)
-        try:
-            cell = mesh.element_finder(mapping=basis.mapping)(*inward[:, None])
-        except ValueError:
-            place = ((point + problem.origin) * problem.length).tolist()
-            raise ValueError(f"the point {place} [m] must lie in the body") from None
-        local = basis.mapping.invF(point[:, None, None], tind=cell)
-        for k, node in enumerate(basis.element_dofs[:, cell[0]]):
-            row[node] = np.asarray(basis.elem.gbasis(basis.mapping, local, k, tind=cell)[0]).item()
-    return np.where(np.abs(values) > ROUNDOFF, values, 0.0)
+def _at_rest(part: LoadedPart, problem: Problem) -> Tensor:
+    """Return the forces of a follower load on the body at rest, (1, N, D) [-]."""
+    force = -part.force(torch.zeros(1, *problem.shape, dtype=torch.float64))
+    return torch.where(force.abs() > ROUNDOFF * force.abs().max(), force, 0.0)

@@ -193,6 +193,7 @@ class ReducedMesh:
             boundary=torch.zeros(len(nodes), dtype=torch.bool),
             springs=None,
             follower_loads=NO_LOADS,
+            links=NO_LOADS.links,
         )
         self.basis = vectors[nodes].flatten(0, 1).contiguous()
 
