@@ -84,6 +84,7 @@ class Scene:
     solver: ReferenceSolver
 
     def __post_init__(self) -> None:
+        self.problem.check_residual_stress()
         if self.problem.has_one_modulus:
             for young in self.loads.moduli:
                 self.problem.check_modulus(young)

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     )
     from dpl.fem.materials.ogden import OgdenK2
     from dpl.fem.materials.parameters import CellField
+    from dpl.fem.materials.prestretched import Prestretched
     from dpl.fem.mesh.generators import box, finger, rectangle
     from dpl.fem.mesh.propeller_mesh import propeller
     from dpl.fem.mesh.reading import read_cell_data, read_mesh
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
     from dpl.fem.solvers.error_estimate import ErrorEstimate, estimate_error
     from dpl.fem.solvers.linear import LinearSolver, ReferenceSolver
     from dpl.fem.solvers.newton import Newton
+    from dpl.fem.solvers.relaxation import relaxed
     from dpl.fem.solvers.rigid_patch import RigidPatch
     from dpl.fem.solvers.solution import Load, Solution, Solver, Status, evaluate_solution, solve
     from dpl.fem.symmetry import symmetries

@@ -385,11 +385,30 @@ class Problem:
 
     def roundoff_bound(self, displacement: Tensor) -> Tensor:
         """Return a bound of the rounding error of ||R_free||, (B,) [-]."""
-        return self._rounding * displacement.abs().amax(dim=(1, 2))
+        return self._rounding * displacement.abs().amax(dim=(1, 2)) + 10 * self.residual_force
 
     @cached_property
     def _rounding(self) -> Tensor:
         return self.discretisation.relative_rounding(self.material)
+
+    @cached_property
+    def residual_force(self) -> float:
+        """||f_int|| of the residual stress at free degrees of freedom [-], see `Prestretched`.
+
+        In equilibrium it is a rounding error.
+        """
+        rest = torch.zeros_like(self.points)[None]
+        if not self.material.residual_stress(self.discretisation.gradient(rest)).any():
+            return 0.0
+        return float(self.acting(self.tensors.internal_force(rest)).norm())
+
+    def check_residual_stress(self) -> None:
+        """Raise a ValueError unless the residual stress is in equilibrium, up to rounding."""
+        if (force := self.reference.residual_force) > self.reference._rounding:
+            raise ValueError(
+                f"material: the residual stress has nodal forces of {force:.3g} E L^2 and "
+                "must be in equilibrium; use mesh and stretch of dpl.fem.relaxed"
+            )
 
     # ------------------------------------------------------------------ the body at rest
 

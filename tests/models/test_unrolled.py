@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import lightning as L
+import numpy as np
 import pytest
 import torch
 
@@ -11,7 +12,17 @@ from benchmarks.samples import solved
 from dpl import training
 from dpl.config import run_folder
 from dpl.data import DataModule
-from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle
+from dpl.fem import (
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Prestretched,
+    Problem,
+    box,
+    rectangle,
+    relaxed,
+)
 from dpl.fem.parity import Parities
 from dpl.fem.rom.pod import scatter_fields
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness, reduced_terms
@@ -29,10 +40,21 @@ from dpl.training import MSE, Surrogate
 from tests.laws import ISOTROPIC, LAWS
 
 SMALL = {"rank": 20, "cells": 8, "stages": 2}
+
+
+def with_residual_stress(mesh):
+    """Return mesh and law of a body of which one side has grown by 15 % along x."""
+    law = NeoHookeanLn(0.3)
+    flat = Problem.build(mesh, law, fixed=Plane(0, 0.0))
+    mesh, stretch = relaxed(flat, lambda x: np.eye(3) - 0.15 * x[:, 2:, None] * np.diag([1, 0, 0]))
+    return mesh, Prestretched(law, stretch)
+
+
 BODIES = {  # mesh, law, linear deflection over L, samples
     "a beam": (box((4, 1, 1), (5, 3, 3)), NeoHookeanLn(0.3), 0.2, 40),
     "a range of Poisson's ratios": (box((3, 1, 1), (4, 3, 3)), NeoHookeanLn((0.1, 0.4)), 0.2, 60),
     "a plane body": (rectangle((4, 1), (9, 3)), NeoHookeanLn(0.3), 0.05, 40),
+    "residual stress": (*with_residual_stress(box((4, 1, 1), (5, 3, 3))), 0.2, 40),
 }
 
 

@@ -152,6 +152,9 @@ class Heterogeneous(Material):
     def tangent(self, H: Tensor) -> Tensor:
         return self._of_all_cells("tangent", H)
 
+    def residual_stress(self, H: Tensor) -> Tensor:
+        return self._of_all_cells("residual_stress", H)
+
     def rest_stress(self, H: Tensor) -> Tensor:
         return self._of_all_cells("rest_stress", H)
 

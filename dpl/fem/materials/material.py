@@ -182,6 +182,10 @@ class Material(Parametrised):
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
         return with_axes(self.mu, 2) * (H + H.mT) + pressure[..., None, None] * eye
 
+    def residual_stress(self, H: Tensor) -> Tensor:
+        """Return P(0) over E, (..., 3, 3) [-], at the points of H (..., 3, 3)."""
+        return torch.zeros_like(H)
+
     @property
     def moduli_at_rest(self) -> tuple[Tensor, ...]:
         """Shear modulus and first Lame parameter at rest over Young's modulus [-]."""

@@ -71,12 +71,15 @@ def write_mesh(path: Path, mesh: skfem.Mesh, fields: Mapping[str, Array]) -> Non
     meshio.write(path, _to_meshio(mesh, fields))
 
 
-def write_mesh_exactly(path: Path, mesh: skfem.Mesh) -> None:
-    """Write a mesh [m] and its tags as VTU, so that `read_mesh` returns the same bits.
+def write_mesh_exactly(
+    path: Path, mesh: skfem.Mesh, cell_data: Mapping[str, Array] | None = None
+) -> None:
+    """Write a mesh [m], its tags and arrays (E, ...) by name as VTU, to be read with the same bits.
 
     Unlike `write_mesh` it does not reorder the nodes of cells, and the file may have any name.
     """
     exact = to_meshio(mesh)
+    exact.cell_data |= {name: [np.asarray(rows)] for name, rows in (cell_data or {}).items()}
     exact.points = _spatial(exact.points)
     marks = {mark: f"&#{ord(mark)};" for mark in '"\t\n\r'}
     exact.cell_data = {  # meshio does not escape names

@@ -119,7 +119,7 @@ def potential_energy(
     parts = zip(displacement.split(count), own.split(count), strict=True)
     strain = torch.cat([problem.with_parameters(nu).energy(part) for part, nu in parts])
     nothing = body.points.new_zeros(1, len(body.cells), 1, 3, 3)
-    at_rest = (body.material.energy(nothing)[..., 0] * body.dV.sum(1)).sum(1)  # not always zero
+    at_rest = (body.material.energy(nothing) * body.dV).sum((-2, -1))  # not always zero
     energy = strain - at_rest - (force * displacement).sum(dim=(1, 2))
     sound = (volume > 0) & energy.isfinite() & slope.flatten(1).isfinite().all(dim=1)
     return energy, slope, sound

@@ -27,7 +27,7 @@ def law_arguments(law: InvariantBasedMaterial) -> LawArguments:
     Args:
         law: The law of the sample cells in the order of the loop.
     """
-    rows = [constants_of(law)[0], *(np.reshape(one, (-1, 1)) for one in (law.mu, law.lam))]
+    rows = [constants_of(law)[0], *(one.reshape(-1, 1).numpy() for one in (law.mu, law.lam))]
     count = max(map(len, rows))
     constants = np.concatenate([np.broadcast_to(row, (count, row.shape[1])) for row in rows], 1)
     key = Law.of(law.compiled_form, SOURCES)

@@ -88,10 +88,10 @@ def mechanical_maps(
 
 
 def unbalanced_stress(law: Material, H: Tensor, linear: Tensor) -> Tensor:
-    """Return [R^T dP, dP], (..., 2, 3, 3), with dP = P(H) - A(0) : linear.
+    """Return [R^T dP, dP], (..., 2, 3, 3), with dP = P(H) - P(0) - A(0) : linear.
 
-    The linear stress A(0) : linear is in equilibrium with the load, so that dP is the stress which
-    is not. R is the rotation of F = I + H (polar decomposition). Where det F is below
+    P(0) is in equilibrium, and A(0) : linear is in equilibrium with the load, so that dP is the
+    stress which is not. R is the rotation of F = I + H (polar decomposition). Where det F is below
     `MIN_VOLUME_RATIO`, H counts as zero, so that the result is finite.
 
     Args:
@@ -101,7 +101,7 @@ def unbalanced_stress(law: Material, H: Tensor, linear: Tensor) -> Tensor:
     """
     valid = volume_change(H) > MIN_VOLUME_RATIO - 1
     H = torch.where(valid[..., None, None], H, 0.0)
-    stress = law.stress(H) - law.rest_stress(linear)
+    stress = law.stress(H) - law.residual_stress(H) - law.rest_stress(linear)
     return torch.stack([product(rotation(H).mT, stress), stress], dim=-3)
 
 
