@@ -132,9 +132,9 @@ class Pairs:
     def constants(self) -> str:
         """Constants that fit best, as keys of a command."""
         body, factor = self._fit
-        words = f"young = {factor * float(self.samples.young[0]):.4g}"
+        words = f"young={factor * float(self.samples.young[0]):.4g}"
         poisson = getattr(body.material, "poisson", None)
-        return f"{words} and poisson = {poisson:.4g}" if isinstance(poisson, float) else words
+        return f"{words} material.poisson={poisson:.4g}" if isinstance(poisson, float) else words
 
     @property
     def _misfit(self) -> str:

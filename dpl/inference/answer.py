@@ -155,5 +155,7 @@ def summarise(state: Solution, kept: bool, error: float, place: RangeCheck) -> s
 
 
 def relative(error: float) -> str:
-    """Return a relative error as text, in percent unless it is very small."""
+    """Return a relative error as text, in percent unless it is very small; NaN is unknown."""
+    if math.isnan(error):
+        return "unknown"
     return f"{100 * error:.2g} %" if error >= LEAST_PERCENTAGE else f"{error:.1e}"

@@ -89,7 +89,7 @@ def test_constants_of_the_law_are_found_from_pairs(law, scene, solved, tmp_path)
     solver = fem.Newton(body, 1e-9)
     other = Scene(body, fem.FileLoads(solver.linear_solver, path, young=9000.0), solver)
     pairs = Pairs(other, path)
-    assert pairs.constants == "young = 4500 and poisson = 0.3"
+    assert pairs.constants == "young=4500 material.poisson=0.3"
     assert pairs.fitted_misfits.max() < 1e-3 < pairs.misfits.min()
 
 
@@ -101,7 +101,7 @@ BAD = {
     "nan.npz": ({"force": np.nan, "displacement": 1}, "must be finite"),
     "double.npz": (
         {"force": 2, "displacement": 1},
-        "young = 9000 and poisson = .* fit the smallest pairs",
+        "young=9000 material.poisson=.* fit the smallest pairs",
     ),
     "moves.npz": ({"force": 1, "displacement": "moved"}, "supports move in 12 pairs"),
     "far.npz": ({"force": 1, "displacement": 1, "points": 3}, "has no point at .* nodes"),

@@ -67,9 +67,9 @@ def test_a_run_on_an_unknown_law_states_errors_of_test_loads_alone(script, folde
 @pytest.mark.parametrize(
     ("command", "options", "match"),
     [
-        ("train", [*DATA, "model=unrolled"], "model: model: Unrolled needs the law"),
-        ("train", [*DATA, "model=fcnn", "loss=lr_star"], "loss: LrStar needs the law"),
-        ("train", [*DATA, "model=fcnn", "loss=energy"], "loss: PotentialEnergyLoss needs the law"),
+        ("train", [*DATA, "model=unrolled"], "model: Unrolled needs the law"),
+        ("train", [*DATA, "model=fcnn", "loss=lr_star"], "loss LrStar needs the law"),
+        ("train", [*DATA, "model=fcnn", "loss=energy"], "loss PotentialEnergyLoss needs the law"),
         ("train", ["model=fcnn"], "a data set other than data=files needs the law"),
         ("generate", [], "generation of a data set needs the law"),
     ],

@@ -80,7 +80,7 @@ class Material(Parametrised):
     def require_known(self, what: str) -> None:
         """Raise a ValueError if `what`, the key or the method that needs it, has no law."""
         if not self.is_known:
-            raise ValueError(f"{what} needs the law of the body, and {self.describe()} is unknown")
+            raise ValueError(f"{what} needs the law of the body; replace {self.describe()} by it")
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density over E, (...,) [-], of H (..., 3, 3) [-]."""

@@ -63,9 +63,8 @@ def read_inp(path: Path) -> meshio.Mesh:
         if kind := KINDS.get(block.keyword):
             labels = _labels(block, known[kind], sets[kind], mesh)
             if name := block.parameters.get(kind):
-                earlier = sets[kind].get(name, [])
-                none = earlier is None or labels is None
-                sets[kind][name] = None if none else [*earlier, *labels]
+                before = sets[kind].get(name, [])
+                sets[kind][name] = None if before is None or labels is None else before + labels
         elif block.keyword == "SURFACE" and (name := block.parameters.get("NAME")):
             if block.parameters.get("TYPE", "").upper() == "NODE":
                 firsts = block._replace(lines=[line.split(",")[0] for line in block.lines])
