@@ -131,11 +131,13 @@ class Scene:
         """
         states = self._typical_states
         values = (self._linear(load).smallest_ritz_value(u) for load, u in states)
-        return min(values) < SOFTENED
+        return min(values, default=1.0) < SOFTENED
 
     @cached_property
     def _typical_states(self) -> list[tuple[Load, Tensor]]:
-        """A few random loads and their equilibria (1, N, D) [-]."""
+        """A few random loads and their equilibria (1, N, D) [-]; none if the law is unknown."""
+        if not self.problem.material.is_known:
+            return []
         loads = self.loads.sample((0, CORRECTOR_STREAM), range(3)).unbatch()
         return [(load, solve(self.solver, load).displacement) for load in loads]
 

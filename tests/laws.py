@@ -11,9 +11,9 @@ FILES = sorted((Path(__file__).parents[1] / "conf" / "material").glob("*.yaml"))
 LOADED = {path.stem: OmegaConf.load(path) for path in FILES}
 NODES = {name: node.get("material", node) for name, node in LOADED.items()}
 LAWS: dict[str, Material] = {  # not those of several regions; Young's modulus at rest is 1
-    name: instantiate(node, _convert_="all").normalised()
+    name: law.normalised()
     for name, node in NODES.items()
-    if "_target_" in node
+    if "_target_" in node and (law := instantiate(node, _convert_="all")).is_known
 }
 HOOKEAN = [type(law) for law in LAWS.values() if isinstance(law, YoungPoissonMaterial)]
 COMPILED = [name for name, law in LAWS.items() if isinstance(law, InvariantBasedMaterial)]

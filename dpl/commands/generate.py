@@ -12,6 +12,8 @@ from dpl.commands.cli import command, extra
 def parts(cfg: DictConfig) -> tuple["dpl.Scene", "dpl.DataSet"]:
     """Return the scene and the data set of a configuration without solving or writing."""
     scene = config.build_scene(cfg)
+    with config.error_in("material"):
+        scene.problem.material.require_known("the generation of a data set")
     return scene, config.instantiate(cfg, "data", scene=scene)
 
 

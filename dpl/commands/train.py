@@ -88,6 +88,7 @@ def _train(cfg: DictConfig) -> float | None:
         _show_unused(surrogate, unused)
         if not trainer.fast_dev_run:
             config.save_config(cfg, folder, without=unused)
+            _draw_data(module, trainer, folder)
     smallest: float | None = None
     try:
         if not is_fitted:
@@ -125,6 +126,16 @@ def _train(cfg: DictConfig) -> float | None:
         return None
     _evaluate(cfg, scene, trainer, session)
     return cli.best_error(trainer) if smallest is None else smallest
+
+
+def _draw_data(module: "data.DataModule", trainer: Any, folder: Path) -> None:
+    """Draw the figure of the data, if it has one, for the folder of the run and TensorBoard."""
+    from dpl.training.callbacks.tensorboard import tensorboard_writers
+
+    if (figure := module.figure()) is not None:
+        figure.savefig(folder / "pairs.png")
+        for writer in tensorboard_writers(trainer):
+            writer.add_figure("data/pairs", figure)
 
 
 def _show_unused(surrogate: "dpl.Surrogate", unused: tuple[str, ...]) -> None:

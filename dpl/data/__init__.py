@@ -7,7 +7,7 @@ from dpl.system.lazy import public_names
 if TYPE_CHECKING:
     from dpl.data.datamodule import DataModule
     from dpl.data.dataset import DataSet
-    from dpl.data.pairs import PairData
+    from dpl.data.pairs import PairData, Pairs
     from dpl.data.samples import Samples
     from dpl.data.sources import Growing, Source, Stored
     from dpl.data.storage.store import Store

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import lightning as L
 import torch
@@ -16,6 +16,9 @@ from dpl.fem import symmetries
 from dpl.fem.symmetry import NO_SYMMETRIES, SymmetryGroup
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class DataModule(L.LightningDataModule):
@@ -80,6 +83,10 @@ class DataModule(L.LightningDataModule):
     def describe(self) -> list[tuple[str, str]]:
         """Return the numbers of loads, and how many of them have to be solved."""
         return self.dataset.describe()
+
+    def figure(self) -> "Figure | None":
+        """Return a figure of the data for the folder of a run, if there is one."""
+        return None
 
     def skipped_work(self) -> list[str]:
         """Return one line for each kind of work that is not needed."""

@@ -58,6 +58,7 @@ class Source:
 
     def check(self, scene: Scene, batch_size: int) -> None:
         """Raise an error if the source cannot serve this scene."""
+        scene.problem.material.require_known("a data set other than data=files")
 
     def count(self, store: Store) -> int:
         """Return the number of loads of a data set whose samples are training samples."""

@@ -57,6 +57,7 @@ class Stream(Source):
 
     def check(self, scene: Scene, batch_size: int) -> None:
         """Check that the buffer can give a batch and fits into the memory of the machine."""
+        super().check(scene, batch_size)
         if self.capacity * self.reuse < batch_size:
             raise ValueError(
                 f"capacity * reuse = {self.capacity} * {self.reuse} must be at least batch_size = "

@@ -29,8 +29,8 @@ def write_results(
     """Write predictions as a series of files for ParaView, see `dpl.fem.write_series`.
 
     `path` is that of the series, without a suffix. With `solve_reference` the finite-element
-    displacement and the error are written too. Returns one row for each load, and the paths of the
-    series.
+    displacement and the error are written too, unless the law is unknown. Returns one row for each
+    load, and the paths of the series.
     """
     scene = surrogate.scene
     rows, steps = [], []
@@ -38,7 +38,7 @@ def write_results(
         with torch.no_grad():
             prediction = surrogate.predict(single)[0]
         truth = None
-        if solve_reference:
+        if solve_reference and scene.problem.material.is_known:
             found = solve(scene.solver, single)
             truth = torch.where(found.converged, found.displacement[0], torch.nan)
         step = nodal_fields(scene, single, prediction, truth)

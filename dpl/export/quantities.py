@@ -32,6 +32,8 @@ class Quantities(nn.Module):
         """Take a surrogate and names of numbers; a residual of a body with ranges is refused."""
         super().__init__()
         self.surrogate, self.names = surrogate, tuple(names)
+        if "residual" in self.names:
+            surrogate.scene.problem.material.require_known("numbers = residual")
         ranges = list(surrogate.scene.loads.parameter_ranges)
         if ranges and (refused := [name for name in self.names if name in BODY_NUMBERS]):
             raise ValueError(

@@ -41,7 +41,11 @@ if TYPE_CHECKING:
         VolumetricK4,
         YeohK2,
     )
-    from dpl.fem.materials.linear_elastic import LinearElastic, SaintVenantKirchhoff
+    from dpl.fem.materials.linear_elastic import (
+        LinearElastic,
+        SaintVenantKirchhoff,
+        UnknownLaw,
+    )
     from dpl.fem.materials.material import Material, Response, YoungPoissonMaterial
     from dpl.fem.materials.neo_hookean import (
         NeoHookeanIsoK2,

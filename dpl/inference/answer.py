@@ -27,7 +27,7 @@ class Answer:
     Attributes:
         displacement: (N, D) [m], a NumPy array or a tensor as the force.
         residual: ||R_free|| / ||f||, evaluated at the displacement [-], see
-            `Problem.relative_residual_of`.
+            `Problem.relative_residual_of`; NaN, as `error` is, if the law of the body is unknown.
         error: Estimated relative error of the displacement [-], see `estimate_error`: no bound. A
             model that `HasCorrection`, such as `unrolled`, states it for loads in range. Infinite
             if an element is inverted or the prediction is not finite.
@@ -126,6 +126,8 @@ def summarise(state: Solution, kept: bool, error: float, place: RangeCheck) -> s
         if error < UNKNOWN:
             words = f"displacement within about {relative(error)} (estimated)"
         words += f", residual {float(state.residual):.1e} of the load"
+        if math.isnan(error):
+            words = "residual and error of the displacement unknown, as is the law"
         if kept:
             words += " (converged)"
         elif state.converged:
@@ -153,5 +155,7 @@ def summarise(state: Solution, kept: bool, error: float, place: RangeCheck) -> s
 
 
 def relative(error: float) -> str:
-    """Return a relative error as text, in percent unless it is very small."""
+    """Return a relative error as text, in percent unless it is very small; NaN is unknown."""
+    if math.isnan(error):
+        return "unknown"
     return f"{100 * error:.2g} %" if error >= LEAST_PERCENTAGE else f"{error:.1e}"

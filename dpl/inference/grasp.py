@@ -113,6 +113,9 @@ class Gripper:
     _last: list[Grip] = field(default_factory=list, repr=False)  # at most one
     _durations: Durations = field(default_factory=Durations, repr=False)
 
+    def __post_init__(self) -> None:
+        self.scene.problem.material.require_known("grasp")
+
     @property
     def scene(self) -> Scene:
         """The scene of the surrogate."""

@@ -113,6 +113,8 @@ class Simulator:
             stability: Factorise the tangent at the result to determine its stability.
         """
         request = Request(tol, budget_ms, error, self._durations, warm)
+        if request.is_more_than_prediction or stability:
+            self.scene.problem.material.require_known("tol, error, budget_ms or stability")
         given = as_numbers("force", force)
         load = as_load(self.scene, given, young, parameters)
         with one_thread(), torch.inference_mode():
@@ -232,7 +234,7 @@ class Simulator:
             )  # fmt: skip
         if found.is_indefinite:
             state = state.unstable()
-        error = max(candidate.error_in_modes, found.error)
+        error = max(found.error, candidate.error_in_modes)  # in this order: NaN stays NaN
         return candidate._replace(state=state, error=error, correction=found.correction)
 
     def _candidates(

@@ -33,6 +33,7 @@ class Loss(L.Callback):
     """Base class of losses; subclasses define `__call__`."""
 
     saves: tuple[str, ...] = ()  # work that this loss saves, one line each
+    needs_law = False  # evaluates stresses
     # precision of displacements and forces of training batches; energies and residuals cancel
     # digits that float32 does not have
     dtype = torch.float64
@@ -109,6 +110,7 @@ class BlendedLoss(Loss):
         check_range(0, start=start)
         self.first, self.second = first, second
         self.saves = tuple(line for line in first.saves if line in second.saves)
+        self.needs_law = first.needs_law or second.needs_law
         self._epochs, self._start, self.weight = epochs, start, 0.0
 
     def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
@@ -141,6 +143,7 @@ class LrStar(Loss):
     """
 
     saves = ("no backward pass through the residual: it is a constant weight",)
+    needs_law = True
     dtype = torch.float32
 
     def __init__(self, *, error: MSE | None = None, limit: float | None = None) -> None:
@@ -170,6 +173,8 @@ class LrStar(Loss):
 
 class LrPlus(Loss):
     """L_r^+ = MSE + weight ||R|| / ||Phi q_max||, differentiable through the residual."""
+
+    needs_law = True
 
     def __init__(self, *, weight: float = 1.0) -> None:
         """Choose the factor on the residual; the paper has 1.
@@ -238,6 +243,7 @@ class PotentialEnergyLoss(_ScaledByStiffness):
     """
 
     saves = ("no displacement of the data set in the loss: it is the potential energy",)
+    needs_law = True
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         self._rest = rest = RestStiffness.of(physics.problem, self._rest)

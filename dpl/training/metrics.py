@@ -77,7 +77,7 @@ class ErrorMetrics(Metric):
             largest_errors(u, batch),
             20 * (_norm(u) / error).log10(),
             relative_errors(u, batch),
-            torch.nan_to_num(residual, nan=torch.inf),
+            torch.nan_to_num(residual, nan=torch.inf if problem.material.is_known else torch.nan),
             volume_ratio,
         )
         self.values.append(torch.stack(columns, dim=1))

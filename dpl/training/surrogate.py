@@ -56,6 +56,8 @@ class Surrogate(TrainedSurrogate, L.LightningModule):
                 of the time).
         """
         super().__init__(net, scene, base=base, young=young)
+        if loss.needs_law:
+            scene.problem.material.require_known(f"loss {type(loss).__name__}")
         self.loss = loss
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler

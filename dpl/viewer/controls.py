@@ -176,7 +176,7 @@ def result_tables(frame: Frame, node: int, amplitude: float) -> tuple[str, str]:
     grasp, answer = frame.grasp, frame.answer
     error, outside = float(answer.error), answer.out_of_distribution
     colour = GOOD if error < GOOD_ERROR else WARNING if error < UNRELIABLE else BAD
-    text = relative(error) if error < UNKNOWN else "above 100 %"
+    text = "above 100 %" if error >= UNKNOWN else relative(error)
     text = f"below {relative(LEAST_PERCENTAGE)}" if error < LEAST_PERCENTAGE else text
     unit = ("N", "N m") if frame.displacement.shape[1] == 3 else ("N/m", "N")
     place = "outside" if outside else "unknown" if np.isnan(answer.out_of_span) else "inside"

@@ -152,6 +152,7 @@ class Body:
         u, surface = displacement / self.scene.length, self.surface
         values = (displacement - reference).norm(dim=1).numpy()[surface.nodes]
         if quantity == STRESS and bool(displacement.any()):  # at rest it is zero up to rounding
+            self.scene.problem.material.require_known(f"colours: {STRESS}")
             with torch.inference_mode():
                 stress = surface.von_mises(u, request.dimensionless(self.scene).parameters)
             values = request.young * stress

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.visualization.figures import draw_body, plot_errors
+    from dpl.visualization.figures import draw_body, plot_errors, plot_misfits
     from dpl.visualization.shapes import plot_deformed
     from dpl.visualization.style import COLOURS, DPI, STYLE
 else:

@@ -1,13 +1,13 @@
 """Figures of deformed bodies and of errors of predictions."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
 
 from dpl.fem import Problem, surface
-from dpl.visualization.style import DPI
+from dpl.visualization.style import COLOURS, DPI
 
 if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
@@ -99,4 +99,29 @@ def plot_errors(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "
         ax.minorticks_off()  # drawing them takes as long as the rest
     title = f"{len(error)} validation loads"
     figure.suptitle(title + (f", {missing} without a finite error" if missing else ""), fontsize=11)
+    return figure
+
+
+def plot_misfits(
+    size: Tensor, misfits: Mapping[str, Tensor], label: str, *, limit: float | None = None
+) -> "Figure":
+    """Return a figure of relative misfits (S,) by name [-] against displacements over L, (S,) [-].
+
+    `label` names the misfits, `limit` is the largest one that is accepted.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.4, 3.4), dpi=DPI, layout="constrained")
+    ax, width = figure.subplots(), size.cpu().numpy()
+    styles = zip(misfits.items(), COLOURS, ("full", "none"), strict=False)
+    for (name, values), colour, fill in styles:
+        height = np.maximum(values.cpu().numpy(), 1e-16)
+        style: dict[str, Any] = {"color": colour, "fillstyle": fill, "markeredgewidth": 0.6}
+        ax.plot(width, height, "o", markersize=3.5, alpha=0.6, label=name, **style)
+    if limit is not None:
+        ax.axhline(limit, color="0.3", linewidth=0.8, linestyle="--", label=f"limit {limit:g}")
+    ax.set(xlabel="largest displacement / L", ylabel=label, xscale="log", yscale="log")
+    ax.grid(visible=True, axis="y", linewidth=0.4)
+    ax.minorticks_off()
+    figure.legend(loc="outside upper center", fontsize=8, frameon=False)
     return figure

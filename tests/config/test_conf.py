@@ -94,7 +94,8 @@ SMALL = {
 
 
 @pytest.mark.parametrize(
-    ("material", "mesh"), [*zip(options("material"), itertools.cycle(SMALL), strict=False)]
+    ("material", "mesh"),
+    [*zip(sorted({*options("material")} - {"unknown"}), itertools.cycle(SMALL), strict=False)],
 )
 def test_every_law_answers_loads_and_every_kind_of_mesh_has_several_laws(scene_of, material, mesh):
     plane = mesh in ("rectangle", "triangle")

@@ -226,7 +226,6 @@ def test_xdmf_is_refused(tmp_path):
         # tables by the largest number: 16 GB
         ("a.msh", GMSH2 + "$Nodes\n1\n2000000000 0 0 0\n$EndNodes\n"
          "$Elements\n1\n1 15 0 2000000000\n$EndElements\n", ENDLESS),
-        ("c.inp", "*NODE\n1,0,0,0\n*NSET,NSET=A,GENERATE\n1,2000000000,1\n", ENDLESS),
         ("d.mesh", "MeshVersionFormatted 2\nDimension 3\nRidges\n99999999999\n", ENDLESS),
         ("a.mdpa", "Begin Nodes\n", "longer than"),  # meshio looks for a node after the end
     ],
@@ -248,7 +247,7 @@ def test_abaqus_files_that_include_others_are_refused(tmp_path):
     for line, match in (
         ("*INCLUDE, INPUT=other.inp", "includes another file"),
         ("*include,input=/etc/passwd", "includes another file"),
-        ("*INCLUDE, INPUT=a.inp", "cannot be read"),
+        ("*INCLUDE, INPUT=a.inp", "includes another file"),
     ):
         path.write_text(f"{whole}{line}\n")
         refused(path, match)

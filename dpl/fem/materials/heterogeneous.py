@@ -134,6 +134,10 @@ class Heterogeneous(Material):
         return "; ".join(f"{name}: {law.describe()}" for name, law in self.laws.items())
 
     @property
+    def is_known(self) -> bool:
+        return all(law.is_known for law in self.laws.values())
+
+    @property
     def has_response(self) -> bool:
         return all(law.has_response for law in self.laws.values())
 

@@ -1,4 +1,4 @@
-"""Hooke's law of small strains, and of the Green-Lagrange strain (Saint Venant-Kirchhoff)."""
+"""Hooke's law of small strains, of the Green-Lagrange strain, and as the base of unknown laws."""
 
 from dataclasses import dataclass
 from functools import singledispatch
@@ -67,6 +67,31 @@ class LinearElastic(YoungPoissonMaterial, SmallStrains):
     iteration solves any load under which det F stays above `Newton.min_detF_ratio` everywhere.
     Below that the step is shortened. There is no solution where the linear one has det F <= 0.
     """
+
+
+@dataclass(frozen=True)
+class UnknownLaw(YoungPoissonMaterial, SmallStrains):
+    """Law of a body of which solutions are known alone: Hooke's law at rest, NaN under strain.
+
+    K(0), linear solutions and networks are those of the elastic constants. Stresses, residuals and
+    estimated errors of a deformed body are NaN, and what needs them is refused.
+    """
+
+    @property
+    def is_known(self) -> bool:
+        return False
+
+    @property
+    def compiled_form(self) -> None:  # type: ignore[override]
+        """None: compiled loops evaluate derivatives, which are Hooke's."""
+        return None
+
+    def energy(self, H: Tensor) -> Tensor:
+        return torch.where((H == 0).all(dim=(-2, -1)), super().energy(H), torch.nan)
+
+    def stress(self, H: Tensor) -> Tensor:
+        is_rest = (H == 0).all(dim=(-2, -1))[..., None, None]
+        return torch.where(is_rest, super().stress(H), torch.nan)
 
 
 @dataclass(frozen=True)

@@ -67,10 +67,20 @@ class Material(Parametrised):
     Strains of a law with fields or of a batch are (B, E, Q, 3, 3), see `Parametrised`.
 
     Attributes:
-        finite: False for the one law whose strain is the symmetric part of H.
+        finite: False for laws whose strain is the symmetric part of H.
     """
 
     finite: ClassVar[bool] = True
+
+    @property
+    def is_known(self) -> bool:
+        """False for a body with `UnknownLaw`, which has no stress under strain."""
+        return True
+
+    def require_known(self, what: str) -> None:
+        """Raise a ValueError if `what`, the key or the method that needs it, has no law."""
+        if not self.is_known:
+            raise ValueError(f"{what} needs the law of the body; replace {self.describe()} by it")
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density over E, (...,) [-], of H (..., 3, 3) [-]."""

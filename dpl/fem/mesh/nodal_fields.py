@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load_file
 from scipy.spatial import cKDTree
 
+from dpl.fem.mesh.sandbox_checks import check_file
 from dpl.system.files import array_names, read_array
 
 VTK = (".vtu", ".vtk", ".vtkhdf")
@@ -27,7 +28,8 @@ def read_nodal_fields(
 
     A folder contains VTK files (.vtu, .vtk, or .vtkhdf with h5py) in the order of their names, each
     with undeformed points, matched by position, and the fields as point arrays. A .vtkhdf file with
-    steps contains several.
+    steps contains several. They are read in this process without the limits of
+    `dpl.fem.mesh.sandbox`: read files of sources that you trust.
 
     Args:
         path: The file or the folder.
@@ -73,6 +75,7 @@ def _read_arrays(path: Path, names: Sequence[str], points: Array, scale: float) 
 
 def _read_vtk(path: Path, names: Sequence[str]) -> tuple[Array, list[Array]]:
     """Return the points (M, 3) of a VTK file and its fields, (S, M, 3) each."""
+    check_file(path)
     try:
         mesh = meshio.read(path)
     except (SystemExit, Exception) as error:  # meshio ends the program on some damaged files

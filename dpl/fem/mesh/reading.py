@@ -37,7 +37,7 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> skfem.Mesh:
     names are regions, see `dpl.fem.Tag`:
 
     - physical groups of Gmsh, by name, or by number ("7") if they have no name;
-    - sets of cells or nodes (.inp and others), by name;
+    - sets of cells or nodes (.inp and others) and surfaces of Abaqus, by name;
     - integer fields on cells or nodes, as "field=value"; if the values are 0 and 1, also as
       "field" for the ones.
 
@@ -50,7 +50,8 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> skfem.Mesh:
         scale: Unit of its coordinates [m]: 1e-3 for millimetres.
 
     Errors number nodes as the file lists them, from 0, and cells in the same way among those that
-    are kept. A warning says which nodes are dropped and which cells are reordered.
+    are kept. A warning says which nodes are dropped, which cells are reordered and which sets
+    cannot be read; regions of their names are refused.
     """
     path = Path(path)
     if not 0 < scale < math.inf:
@@ -129,7 +130,10 @@ def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
     mesh = from_meshio(meshio.Mesh(points, [(kind, compact)]))
     corners = np.unique(cells[:, : len(mesh.t)])  # vertex k is node corners[k] of the file
     mesh = _add_tags(check_mesh(mesh, numbers=corners), raw, kind, corners)
-    return mesh, _repairs(mesh.elem.refdom, points[compact], unused)
+    repairs = _repairs(mesh.elem.refdom, points[compact], unused)
+    if lost := [repr(name) for name, members in raw.point_sets.items() if not np.size(members)]:
+        repairs.append(f"sets without members or that cannot be read: {', '.join(lost)}")
+    return mesh, repairs
 
 
 def _cell_type(raw: meshio.Mesh) -> str:

@@ -58,6 +58,7 @@ def estimate_error(
     finite. If a step finds negative curvature, the estimate is infinite where the relative residual
     is below `NEAR`: an equilibrium near u is unstable or near a critical load. Where the residual
     is larger, stresses of the error itself cause it, and the estimate is `DOUBT` ||M R|| / ||u||.
+    Without a known law the estimate is NaN.
 
     Source: Deuflhard (2011), Newton Methods for Nonlinear Problems, section 3.3 (corrections as
     error estimates); Mueller, Dorsey, McMillan, Jagnow, Cutler (2002), Stable real-time
@@ -71,6 +72,8 @@ def estimate_error(
             the load softens the body.
     """
     problem = solver.problem.with_parameters(load.parameters)
+    if not problem.material.is_known:
+        return ErrorEstimate(math.nan)
     internal, volume = evaluation or problem.evaluate(displacement)
     right = problem.restrict((load.force - internal)[0])
     size = dnrm2(displacement.numpy().ravel())

@@ -97,6 +97,7 @@ class Newton:
             guess: Displacement to start from, (B, N, D) [-]; zero where it inverts an element.
         """
         check_force(self.problem, load)
+        self.problem.material.require_known("Newton's method")
         members = load._replace(force=self.problem.acting(load.force)).unbatch()
         guesses = [None] * len(members) if guess is None else guess.split(1)
         solvers = (self.with_parameters(member.parameters) for member in members)

@@ -134,9 +134,9 @@ class Unrolled(StoredBuffers):
         super().__init__()
         check_range(1, MAX_SIZE, rank=rank, cells=cells)
         check_range(0, MAX_SIZE, stages=stages)
-        self.scene = scene
-        self.rank, self.sample_count, self.stages = rank, cells, stages
         constant, problem = scene.loads.constant_force, scene.problem
+        problem.material.require_known("Unrolled")
+        self.scene, self.rank, self.sample_count, self.stages = scene, rank, cells, stages
         also = [] if constant is None else [constant]
         self.group = symmetries(problem, also=also) if symmetry else SymmetryGroup.identity(problem)
         self.linear = LinearResponse(scene, self.group)
