@@ -72,6 +72,8 @@ def write_animation(body: "viewer.Body", path: Path) -> None:
 
     if path.suffix not in FORMATS:
         raise config.ConfigError(f"animation = {path} must end with {' or '.join(FORMATS)}")
+    with config.error_in("animation"):
+        body.scene.problem.material.require_known("a comparison with finite elements")
     try:
         animate_load(body, path)
     except ImportError as error:  # imageio-ffmpeg
