@@ -151,5 +151,5 @@ def forcing_term(residual: float, previous: float, *, tol: float, corotational: 
     """
     enough = 0.1 * tol / residual if residual > 0 else 0.0
     first = 1e-3 if corotational else 0.0
-    earned = 0.01 * (residual / previous) ** 2 if previous > 0 else first
+    earned = 0.01 * min(residual / previous, 1.0) ** 2 if previous > 0 else first
     return max(1e-12, enough, min(1e-3, earned))
