@@ -4,6 +4,7 @@ import math
 import warnings
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import skfem
 import torch
@@ -87,7 +88,8 @@ def _displacement(body: Problem, law: Prestretched) -> Tensor | None:
 
     None if no stable equilibrium is found: growth in a fixed shape can make K(0) indefinite.
     """
-    stressed = _Unbalanced(**body.__getstate__() | {"material": law})
+    parts: dict[str, Any] = {**body.__getstate__(), "material": law}
+    stressed = _Unbalanced(**parts)
     guess = LinearSolver(body).solve(-stressed.force_at_rest)[None]
     load = Load(torch.zeros_like(guess), torch.ones(1, dtype=torch.float64))
     newton = Newton(stressed, LEAST_TOL, min_load_step=0.9, max_total_iter=MAX_ITER)
