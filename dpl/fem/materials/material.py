@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import product
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import torch
 from torch import Tensor
@@ -322,7 +322,7 @@ class BulkOrPoisson(Material, Scalable):
     def compressible(self) -> Self:
         number = isinstance(self.bulk if self.poisson is None else self.poisson, int | float)
         changes = number and self._is_nearly_incompressible
-        return replace(self, bulk=None, poisson=0.0) if changes else self
+        return replace(cast("Any", self), bulk=None, poisson=0.0) if changes else self
 
     def normalised(self) -> Self:
         """Return the law with E at rest = 1; itself if a constant is a field, which is over E."""
