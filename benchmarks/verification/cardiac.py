@@ -31,9 +31,9 @@ CONTRACTED = ((2, 6, 2), (3, 9, 3), (4, 12, 4))
 BULKS = (1e2, 1e3, 1e4, 1e5)  # [kPa]; the last is 1e4 times the shear moduli at rest and more
 
 
-def beam(cells: Cells, bulk: float) -> fem.Problem:
+def beam(cells: Cells, bulk: float, cell: str = "hexahedron") -> fem.Problem:
     """Return the bar 10 x 1 x 1 mm with fibres along x; cells are smaller near the fixed end."""
-    mesh = fem.box([1.0, 1.0, 1.0], [n + 1 for n in cells])
+    mesh = fem.box([1.0, 1.0, 1.0], [n + 1 for n in cells], cell)
     x, y, z = mesh.p
     law = fem.FibreReinforced(
         fem.VolumetricK4(bulk), fem.Guccione(2.0, 8.0, 2.0, 4.0), fem.ConstantFibres([1, 0, 0])
@@ -49,22 +49,24 @@ def beam(cells: Cells, bulk: float) -> fem.Problem:
     )
 
 
-def beam_tip(cells: Cells, bulk: float = BULKS[-1]) -> tuple[float, int]:
+def beam_tip(
+    cells: Cells, bulk: float = BULKS[-1], *, cell: str = "hexahedron"
+) -> tuple[float, int]:
     """Return z [mm] of the deformed point (10, 0.5, 1), and the Newton iterations from rest."""
-    problem = beam(cells, bulk)
+    problem = beam(cells, bulk, cell)
     points = problem.points.numpy() + problem.origin
     node = int(np.linalg.norm(points - [10.0, 0.5, 1.0], axis=1).argmin())
     solution = balanced(fem.Newton(problem, tol=TOL))
     return 1.0 + float(solution.displacement[0, node, 2]), int(solution.iterations)
 
 
-def inflated(cells: Cells, bulk: float) -> fem.Problem:
+def inflated(cells: Cells, bulk: float, cell: str = "hexahedron") -> fem.Problem:
     """Return a quarter of the isotropic ventricle under 10 kPa."""
     law = fem.FibreReinforced(
         fem.VolumetricK4(bulk), fem.Guccione(10.0, 1.0, 1.0, 1.0), fem.ConstantFibres([1, 0, 0])
     )
     return fem.Problem.build(
-        ventricle(*cells, quarter=True),
+        ventricle(*cells, quarter=True, cell=cell),
         law,
         supports=[
             fem.DirichletBC(fem.Plane(0, 0.0), [0.0, None, None]),

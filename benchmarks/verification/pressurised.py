@@ -19,6 +19,7 @@ from benchmarks.study import picture
 from benchmarks.verification.bodies import Array
 from benchmarks.verification.drawing import measured, panel
 from benchmarks.verification.report import Row, Section
+from benchmarks.verification.ventricle import CURVED
 from dpl import fem
 
 INNER, OUTER = 1.0, 2.0  # radii [m]
@@ -82,12 +83,13 @@ def sector(dim: int, cells: int, shape: str, *, quadratic: bool) -> skfem.Mesh:
             mesh = {"triangle": skfem.MeshTri2, "quad": skfem.MeshQuad2}[shape].from_mesh(mesh)
         radius, angle = INNER + mesh.doflocs[0], np.pi / 2 * mesh.doflocs[1]
         return replace(mesh, doflocs=radius * np.stack([np.cos(angle), np.sin(angle)]))
-    patch = fem.box([1.0] * 3, [cells + 1] * 3)  # coordinates: radius and two of a side of a cube
+    # coordinates: radius and two of a side of a cube
+    patch = fem.box([1.0] * 3, [cells + 1] * 3, shape)
     radius = INNER + patch.p[0]
     at = radius * np.stack([patch.p[1], patch.p[2], np.ones_like(radius)])
-    parts = [skfem.MeshHex(np.roll(at, k, axis=0), patch.t) for k in range(3)]
+    parts = [type(patch)(np.roll(at, k, axis=0), patch.t) for k in range(3)]
     mesh = parts[0] + parts[1] + parts[2]
-    mesh = skfem.MeshHex2.from_mesh(mesh) if quadratic else mesh
+    mesh = CURVED[type(mesh)].from_mesh(mesh) if quadratic else mesh
     x = mesh.doflocs
     return replace(mesh, doflocs=x * x.max(axis=0) / np.linalg.norm(x, axis=0))
 

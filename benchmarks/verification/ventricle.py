@@ -21,14 +21,16 @@ from dpl.fem import box
 SHORT, LONG, WALL, BASE = 7.0, 17.0, 3.0, 5.0  # endocardial half axes, thickness, z of the base
 ON_SURFACE = 1e-6  # largest value of the equation of a surface at its nodes
 DEPTH_ITER = 20  # Newton iterations for the depth of a point
+CURVED = {skfem.MeshHex: skfem.MeshHex2, skfem.MeshTet: skfem.MeshTet2}
 PATCH = 0.35  # half side of the square patch at the apex in the plane of parameters
 EDGE, BULGE = 0.26, 0.12  # half side of this patch in the unit disc, and curvature of its sides
 
 
 def ventricle(
-    patch: int, rings: int, layers: int, *, quarter: bool = False, degree: int = 2
-) -> skfem.Mesh:
-    """Return hexahedra [mm] of the wall: a square patch at the apex and rings of cells around it.
+    patch: int, rings: int, layers: int, *, quarter: bool = False, degree: int = 2,
+    cell: str = "hexahedron",
+) -> skfem.Mesh:  # fmt: skip
+    """Return cells [mm] of the wall: a square patch at the apex and rings of cells around it.
 
     Args:
         patch: Cells along a half side of the patch; a quarter of a ring has 2 `patch` cells.
@@ -36,21 +38,24 @@ def ventricle(
         layers: Cells through the wall.
         quarter: Mesh x >= 0 and y >= 0 alone.
         degree: Degree of the geometry, 1 or 2.
+        cell: "hexahedron", or for a quarter "tetra": six tetrahedra in each.
     """
     sides, start = (1, 0.0) if quarter else (2, -PATCH)
     counts = sides * patch + 1, layers + 1
-    square = box([PATCH - start] * 2 + [1.0], [counts[0], *counts]).translated([start, start, 0.0])
-    strip = box([1.0] * 3, [rings + 1, *counts])
+    square = box([PATCH - start] * 2 + [1.0], [counts[0], *counts], cell)
+    square = square.translated([start, start, 0.0])
+    strip = box([1.0] * 3, [rings + 1, *counts], cell)
     distance = PATCH + (1 - PATCH) * strip.p[0]
     across, t = strip.p[1], strip.p[2]
     if quarter:
-        ring = [(distance, distance * across), (distance * (1 - across), distance)]
+        along = across if cell == "tetra" else 1 - across  # tetrahedra share the diagonals of faces
+        ring = [(distance, distance * across), (distance * along, distance)]
     else:
         x, y = distance, distance * (2 * across - 1)
         ring = [(x, y), (-y, x), (-x, -y), (y, -x)]
-    parts = [skfem.MeshHex(np.stack([*sector, t]), strip.t) for sector in ring]
+    parts = [type(strip)(np.stack([*sector, t]), strip.t) for sector in ring]
     mesh = reduce(add, parts, square)
-    mesh = skfem.MeshHex2.from_mesh(mesh) if degree == 2 else mesh
+    mesh = CURVED[type(mesh)].from_mesh(mesh) if degree == 2 else mesh
     return replace(mesh, doflocs=_placed(mesh.doflocs))
 
 

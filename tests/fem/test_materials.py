@@ -292,6 +292,24 @@ def test_body_at_rest_has_neither_energy_nor_stress(law):
         assert EnergyAlone(law).stress(rest).abs().max() < 1e-15
 
 
+@pytest.mark.parametrize(
+    ("law", "ratio"),
+    [
+        (fem.NeoHookeanLn(0.4999), 0.0),
+        (fem.YeohK2(0.2, -0.02, 0.005, bulk=4e4), 0.0),
+        (fem.Heterogeneous({"soft": fem.OgdenK2([1.0], [2.0], poisson=0.49)}, {}), 0.0),
+        (fem.NeoHookeanLn(0.45), 0.45),
+        (fem.NeoHookeanLn((0.2, 0.49)), 0.49),
+    ],
+)
+def test_a_nearly_incompressible_law_becomes_compressible(law, ratio):
+    """Laws of other bodies, and those with a range, stay as they are."""
+    found = law.compressible()
+    laws = found.parts.values() or [found]
+    assert max(one.largest_poisson_ratio for one in laws) == pytest.approx(ratio, abs=1e-12)
+    assert found.compressible() is found
+
+
 @pytest.mark.parametrize("poisson", [-0.9, 0.0, 0.3, 0.4999])
 def test_tangent_at_rest_is_hooke(hookean, poisson):
     law, rest = hookean(poisson), torch.zeros(3, 3, dtype=torch.float64)

@@ -1,5 +1,6 @@
 """Mean dilatation: volume ratios projected in linear and quadratic cells, and Newton's method."""
 
+import math
 import warnings
 from dataclasses import replace
 from itertools import cycle
@@ -11,7 +12,8 @@ from laws import ISOTROPIC, LAWS
 from solving import Uncompiled, assert_derivatives, load_of, poisson, uncompiled, without_load
 from torch.testing import assert_close
 
-from benchmarks.verification.refinement import sheared
+from benchmarks.verification.dilatation import MEMBRANE, solved
+from benchmarks.verification.taylor_hood import taylor_hood
 from dpl import fem
 
 CELLS = [("quad", 1), ("quad", 2), ("hexahedron", 1), ("triangle", 2), ("tetra", 2)]
@@ -115,7 +117,8 @@ def test_mean_dilatation_is_refused_of_linear_simplices(grid, cell):
 @pytest.mark.parametrize("nu", [0.3, 0.45, 0.49, 0.4999])
 def test_cook_s_membrane_of_quadratic_triangles_has_the_tip_of_a_fine_mesh(nu):
     """Within 0.5 % of quadratic quadrilaterals with half their size, in at most 7 iterations."""
-    (tip, count), (fine, _) = sheared(nu, 8, "triangle"), sheared(nu, 16, "quad")
+    tip, count = solved(MEMBRANE, nu, 8, "triangle", 2)
+    fine, _ = solved(MEMBRANE, nu, 16, "quad", 2)
     assert tip == pytest.approx(fine, rel=5e-3)
     assert count <= 7
 
@@ -291,3 +294,19 @@ def test_bulk_modulus_of_the_points_is_that_of_fibres_and_of_quadratic_simplices
     problem = muscle(9.0)
     u = 0.05 * problem.points[None]
     assert_close(problem.energy(u), replace(problem, volume_functions=None).energy(u))
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetra"])
+def test_taylor_hood_elements_have_the_pressure_of_a_homogeneous_stretch(grid, cell):
+    """P = -kappa (J - 1) of NHiso-k2; the reference of the verification page."""
+    mesh = grid(cell)
+    bare = fem.Problem.build(mesh, fem.NeoHookeanIsoK2(0.45), degree=2, length=1.0)
+    dim = mesh.dim()
+    given = bare.points.numpy() @ np.diag([0.1, -0.05, 0.02][:dim])
+    problem = fem.Problem.build(
+        mesh, bare.material, fixed=bare.boundary.numpy(), prescribed=given, degree=2, length=1.0
+    )
+    found = taylor_hood(problem, 0.45)
+    J = math.prod([1.1, 0.95, 1.02][:dim])
+    assert_close(found.displacement.numpy(), given, rtol=0, atol=1e-9)
+    assert found.pressure == pytest.approx((1 - J) / (3 * (1 - 2 * 0.45)), rel=1e-8)

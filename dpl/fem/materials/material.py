@@ -7,9 +7,9 @@ its stress as a difference of terms that cancel at rest.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import product
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import torch
 from torch import Tensor
@@ -18,6 +18,8 @@ from dpl.fem.identity import identity_of
 from dpl.fem.materials.parameters import CellField, Constant, Parametrised, Scalable
 from dpl.fem.materials.tensors import green_lagrange, trace, with_axes
 from dpl.fem.options import option
+
+NEARLY_INCOMPRESSIBLE = 0.45  # largest Poisson's ratio at rest of other laws [-]
 
 
 class Response(NamedTuple):
@@ -207,6 +209,10 @@ class Material(Parametrised):
         return max(float(law.poisson_ratio.max()) for law in self._at_ends)
 
     @property
+    def _is_nearly_incompressible(self) -> bool:
+        return self.largest_poisson_ratio > NEARLY_INCOMPRESSIBLE
+
+    @property
     def _at_ends(self) -> list[Self]:
         """The law at each combination of the ends of its ranges."""
         ends = product(*self.parameter_ranges.values())
@@ -228,6 +234,13 @@ class Material(Parametrised):
     def normalised(self) -> Self:
         """Return the law with E at rest = 1; itself if its moduli are over E by definition."""
         return self
+
+    def compressible(self) -> Self:
+        """Return the law with Poisson's ratio 0 at rest if it is above `NEARLY_INCOMPRESSIBLE`.
+
+        A ratio or bulk modulus that is a range or a field stays.
+        """
+        return self._changed({key: part.compressible() for key, part in self.parts.items()})
 
     @property
     def _technical_moduli(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -279,6 +292,10 @@ class YoungPoissonMaterial(Material, Scalable):
     def mu(self) -> Tensor:
         return self.value("young") / (2.0 * (1.0 + self.value("poisson")))
 
+    def compressible(self) -> Self:
+        number = isinstance(self.poisson, int | float)
+        return replace(self, poisson=0.0) if number and self._is_nearly_incompressible else self
+
     @property
     def lam(self) -> Tensor:
         nu = self.value("poisson")
@@ -315,6 +332,11 @@ class BulkOrPoisson(Material, Scalable):
     @property
     def lam(self) -> Tensor:
         return self.bulk_modulus - 2 / 3 * self.mu
+
+    def compressible(self) -> Self:
+        number = isinstance(self.bulk if self.poisson is None else self.poisson, int | float)
+        changes = number and self._is_nearly_incompressible
+        return replace(cast("Any", self), bulk=None, poisson=0.0) if changes else self
 
     def normalised(self) -> Self:
         """Return the law with E at rest = 1; itself if a constant is a field, which is over E."""

@@ -1,12 +1,14 @@
 """Fit of `dpl.models.Unrolled` to samples: modes, sample cells and maps."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dpl.fem.materials.material import Material
+from dpl.fem.problem import Problem
 from dpl.fem.rom.pod import MIN_SKETCH_SIZE, pod, scatter_fields
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness, reduced_terms
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
@@ -25,6 +27,17 @@ MIN_RANK = 40  # modes; fewer are not tried
 NOISE = 5e-7  # singular value over the largest below which a mode is rounding error
 LIMIT = 1.5  # factor on the largest ratio of corrections in the samples
 MIN_GAIN = 0.97  # largest ratio of held-out errors for which another map is worth its time
+
+
+def sampled_terms(terms: StiffnessTerms) -> StiffnessTerms:
+    """Return K(0) of the body with the law that is sampled, see `Material.compressible`.
+
+    Modes change the volume of cells. The stress by which a nearly incompressible law resists hides
+    the stress that deforms the body.
+    """
+    law = terms.problem.material.compressible()
+    same = law is terms.problem.material
+    return terms if same else StiffnessTerms.of(replace(terms.problem, material=law))
 
 
 class Maps(NamedTuple):
@@ -216,9 +229,8 @@ def _features(law: Material, cells: SampleCells, samples: Columns, c: Tensor | N
 
 def fit_maps(
     linear: LinearResponse,
-    modes: Tensor,
-    parity: Tensor,
-    inverse: Tensor,
+    body: Problem,
+    in_modes: tuple[Tensor, Tensor, Tensor],
     sets: tuple[Columns, Columns],
     *,
     copies: int,
@@ -229,13 +241,14 @@ def fit_maps(
 
     Args:
         linear: Linear solutions of the body.
-        modes, parity: V, (n, R), and the parity of each mode, (R,).
-        inverse: (V^T K(0) V)^-1, (R, R).
+        body: The body with the law that is sampled.
+        in_modes: V, (n, R), the parity of each mode, (R,), and (V^T K(0) V)^-1 of `body`, (R, R).
         sets: Samples to fit to, and to choose by.
         copies: Number of images of each sample in the first set, see `fit_map`.
         cells, stages: Numbers of sample cells, and largest number of maps after the first.
     """
     problem, parities = linear.scene.problem, linear.form.parities
+    modes, parity, inverse = in_modes
     images = linear.group.cell_images(problem)
     fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])
     parity_of_fields = torch.cat([parity, torch.zeros(1, dtype=torch.int64)])
@@ -247,8 +260,8 @@ def fit_maps(
     columns = symmetry.orbits(1).symmetrised(gradients.flatten(1).T, parity_of_fields, parities)
     # rounded before the fit: the maps cancel digits, so that G must stay what it is
     sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
-    law = problem.material.of_cells(numbers).centred()
-    priors = mechanical_maps(problem, numbers, sample_cells.gradients[:-1], inverse)
+    law = body.material.of_cells(numbers).centred()
+    priors = mechanical_maps(body, numbers, sample_cells.gradients[:-1], inverse)
     options = {"copies": copies, "stages": stages}
     maps, missed = maps_at_cells(law, sample_cells, symmetry, priors, sets, **options)
     first, *others = (one.float() for one in maps.matrices)
@@ -263,19 +276,20 @@ def fit_maps(
 
 
 def fit_in_best_modes(
-    linear: LinearResponse, both: tuple[Sample, Sample], *, rank: int, cells: int, stages: int
-) -> tuple[dict[str, Tensor], Tensor]:
+    linear: LinearResponse, terms: StiffnessTerms, both: tuple[Sample, Sample], *, rank: int,
+    cells: int, stages: int,
+) -> tuple[dict[str, Tensor], Tensor]:  # fmt: skip
     """Fit the maps at all cells and at half as many, then in more modes, as long as that is better.
 
-    The samples are those to fit to, and those to choose by. `rank`, `cells` and `stages` are the
-    largest numbers of modes, of sample cells, and of maps after the first.
+    `terms` are those of the body whose law is sampled. The samples are those to fit to, and those
+    to choose by. `rank`, `cells` and `stages` are the largest numbers of modes, of sample cells,
+    and of maps after the first.
 
     Returns:
         The buffers of `dpl.models.Unrolled`, by name, of the fit with the smallest weighted mean
         error of held-out samples; and all modes, (n, R).
     """
-    problem, terms = linear.scene.problem, linear.terms
-    free = problem.free
+    free = linear.scene.problem.free
     rests = [
         torch.cat([u[:, free] - linear(f[:, free], own) for f, u, _, own in _chunks(part)])
         for part in both
@@ -285,7 +299,7 @@ def fit_in_best_modes(
     inverses = [symmetry.inverse for symmetry in linear.group.coset_representatives()]
     few = inverses[: max(1, MAX_ROWS // len(rests[0]))]
     turned = [_image(every.T, one, free).T for one in few]
-    factors = terms.factors(problem.reference.material)
+    factors = terms.factors(terms.problem.reference.material)
 
     def fit(count: int, cells: int) -> tuple[float, dict[str, Tensor]]:
         modes = every[:, :count]
@@ -296,8 +310,8 @@ def fit_in_best_modes(
         held = in_coordinates(terms, modes, stiffness, both[1], rests[1])
         inverse = torch.from_numpy(stiffness.inverse(factors)[0])
         options = {"copies": len(turned), "cells": cells, "stages": stages}
-        sets = fitted, held
-        found, missed = fit_maps(linear, modes, parity[:count], inverse, sets, **options)
+        in_modes, sets = (modes, parity[:count], inverse), (fitted, held)
+        found, missed = fit_maps(linear, terms.problem, in_modes, sets, **options)
         outside = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)
         square = missed.square().sum(dim=1) + outside.clamp(min=0)
         own = {"modes": modes.float(), "parity": parity[:count], "stiffness": stiffness.parts}

@@ -21,7 +21,7 @@ from dpl.models.linear_base import SCALE_STREAM
 from dpl.models.linear_response import Array, LinearResponse, OrbitArrays, Solve, largest
 from dpl.models.unrolled.compiled import LawArguments, law_arguments, model_arrays
 from dpl.models.unrolled.correction import LOADS, choose_newton, fit_errors, relative_errors
-from dpl.models.unrolled.fit import fit_in_best_modes
+from dpl.models.unrolled.fit import fit_in_best_modes, sampled_terms
 from dpl.models.unrolled.loops import ModelArrays, predict
 from dpl.models.unrolled.products import Tensors, nonlinear_coordinates
 from dpl.scene import Sample, Scene
@@ -56,7 +56,8 @@ class Unrolled(StoredBuffers):
     (`mechanical_maps`). It is chosen by leave-one-out errors.
 
     c_lin is the equilibrium of the linear body in the same modes as c. It differs from the linear
-    solution, but the maps only ever see fields in the modes.
+    solution, but the maps only ever see fields in the modes. c_lin and phi of a nearly
+    incompressible body are those of a compressible one, see `sampled_terms`.
 
     The numbers of modes, cells and maps are chosen by the error of the held-out samples. Each mode
     is even or odd under the reflections and half turns of the body (`dpl.fem.parity`), and the maps
@@ -73,6 +74,7 @@ class Unrolled(StoredBuffers):
     Attributes:
         scene: The scene to predict.
         linear: The linear solution.
+        terms: K(0) of the body whose law is sampled.
         modes: V at free degrees of freedom, (n, R).
         parity: Parity of each mode, (R,), see `dpl.fem.parity`.
         stiffness: V^T K(0) [V, p] by its dependence on the moduli, see `ReducedStiffness`,
@@ -140,10 +142,11 @@ class Unrolled(StoredBuffers):
         also = [] if constant is None else [constant]
         self.group = symmetries(problem, also=also) if symmetry else SymmetryGroup.identity(problem)
         self.linear = LinearResponse(scene, self.group)
+        self.terms = sampled_terms(self.linear.terms)
         self._has_loops = isinstance(one_law(problem.reference.material), InvariantBasedMaterial)
         for name, (shape, dtype) in self._layout().items():
             self.register_buffer(name, torch.zeros(shape, dtype=dtype))
-        self._stiffness = ReducedStiffness(self.stiffness, self.linear.terms)
+        self._stiffness = ReducedStiffness(self.stiffness, self.terms)
         self._kept: dict[torch.device, tuple[Tensors, Material, Tensor]] = {}
         self._last: tuple[Tensor, tuple[LawArguments, Array, Solve]] | None = None
         self.register_buffer("prescribed", problem.prescribed, persistent=False)
@@ -157,7 +160,7 @@ class Unrolled(StoredBuffers):
         return {
             "modes": ((free, modes), torch.float32),
             "parity": ((modes,), torch.int64),
-            "stiffness": ((len(self.linear.terms) + 1, modes, modes + 1), torch.float64),
+            "stiffness": ((len(self.terms) + 1, modes, modes + 1), torch.float64),
             "cells": ((cells,), torch.int64),
             "gradients": ((modes + 1, cells, dim, dim), torch.float64),
             "first_map": ((entries, modes), torch.float32),
@@ -220,7 +223,7 @@ class Unrolled(StoredBuffers):
         force, parameters = self.linear.dead_loads(force, parameters)
         if self._is_compiled(force, parameters):
             return self._compiled_fields(force, parameters)
-        factors = self.linear.terms.factors(self.scene.problem.material.with_parameters(parameters))
+        factors = self.terms.factors(self.terms.problem.material.with_parameters(parameters))
         parts, solved = self.linear.by_parity(force, parameters)  # (B, M, m)
         model, of_samples, places = self._tensors(force.device)
         right = model.modes.to(parts) @ parts.permute(1, 2, 0)
@@ -237,7 +240,7 @@ class Unrolled(StoredBuffers):
     def _prepare(self) -> None:
         """Prepare what follows from the buffers."""
         parts = self.stiffness.detach().cpu().clone()
-        self._stiffness = ReducedStiffness(parts, self.linear.terms)
+        self._stiffness = ReducedStiffness(parts, self.terms)
         self._last = None
         self._kept = {}
         for name in ("_doubt", "_arrays"):
@@ -255,7 +258,7 @@ class Unrolled(StoredBuffers):
         orbits = OrbitArrays(*map(on_device, arrays.orbits))
         modes = arrays.modes.astype(self.linear.blocks.values.dtype)
         model = ModelArrays(orbits, *map(on_device, arrays[1:]))._replace(modes=on_device(modes))
-        law = self.scene.problem.material.of_cells(self.cells.cpu()[cells]).centred()
+        law = self.terms.problem.material.of_cells(self.cells.cpu()[cells]).centred()
         places = on_device(arrays.columns.ravel().argsort()[: self.modes.shape[1]])
         found = model, law, places
         if not torch.compiler.is_compiling():  # tensors of a traced graph lack values
@@ -299,11 +302,12 @@ class Unrolled(StoredBuffers):
         last = self._last  # read once: another thread may replace it
         if last and torch.equal(last[0], parameters):
             return last[1]
-        law = self.scene.problem.material.with_parameters(parameters)
+        law = self.terms.problem.material.with_parameters(parameters)
         of_cells = one_law(law.of_cells(self.cells[self._arrays[1]]).centred())
-        inverse, _ = self._stiffness.inverse(self.linear.terms.factors(law))
+        inverse, _ = self._stiffness.inverse(self.terms.factors(law))
         arguments = law_arguments(cast("InvariantBasedMaterial", of_cells))
-        found = arguments, inverse, self.linear.at(law)
+        linear = self.linear.at(self.scene.problem.material.with_parameters(parameters))
+        found = arguments, inverse, linear
         self._last = parameters.clone(), found
         return found
 
@@ -327,7 +331,7 @@ class Unrolled(StoredBuffers):
         """
         options = {"rank": self.rank, "cells": self.sample_count, "stages": self.stages}
         dead = self._of_dead_loads(samples), self._of_dead_loads(held_out)
-        best, every = fit_in_best_modes(self.linear, dead, **options)
+        best, every = fit_in_best_modes(self.linear, self.terms, dead, **options)
         for name, buffer in best.items():
             setattr(self, name, buffer)
         self._prepare()
@@ -394,7 +398,7 @@ class Unrolled(StoredBuffers):
         for name in ("limits", "newton_weights", "least_sizes", "ratios"):
             if (getattr(self, name) < 0).any():
                 raise ValueError(f"{name} must be 0 or more")
-        factors = self.linear.terms.factors(problem.reference.material)
-        matrix = ReducedStiffness(self.stiffness.cpu(), self.linear.terms).at(factors)[0, :, :-1]
+        factors = self.terms.factors(self.terms.problem.reference.material)
+        matrix = ReducedStiffness(self.stiffness.cpu(), self.terms).at(factors)[0, :, :-1]
         if torch.linalg.cholesky_ex(matrix).info:
             raise ValueError("stiffness must be positive definite")
