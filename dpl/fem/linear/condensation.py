@@ -106,8 +106,8 @@ def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Cond
     stay together. A matrix that is not positive definite raises a `SingularMatrix`.
     """
     run = next(r for r in (3, 2, 1) if np.array_equal(points, np.repeat(points[::r], r, axis=0)))
-    graph = coo_array(sum(abs(matrix) for matrix in matrices))
-    graph = csr_array((graph.data, (graph.row // run, graph.col // run)))  # of nodes
+    entries = coo_array(sum(abs(matrix) for matrix in matrices))
+    graph = csr_array((entries.data, (entries.row // run, entries.col // run)))  # of nodes
     tree: list[tuple[Integers, tuple[int, ...]]] = []
     _dissect(graph, points[::run], np.arange(graph.shape[0]), tree, LEAF // run)
     rank, position = np.empty(graph.shape[0], np.int64), np.empty(len(points), np.int64)

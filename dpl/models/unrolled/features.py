@@ -118,7 +118,7 @@ def at_points(rows: Tensor) -> Tensor:
 def _stress(law: Material, H: Tensor, change: Tensor) -> Tensor:
     """Return P in rows of H in rows, det F = 1 + change; see `InvariantBasedMaterial`.
 
-    E (I - X) is taken from the minors of 2 E, so that no terms cancel: graphs are small.
+    I - X = 2 E X is taken from the cofactors of 2 E, in which no terms cancel.
     """
     law = one_law(law)
     if not isinstance(law, InvariantBasedMaterial):
@@ -133,7 +133,7 @@ def _stress(law: Material, H: Tensor, change: Tensor) -> Tensor:
     found = law.invariant_derivatives(law.constants, first, other, j, log_j, m1)
     rest, W2, p = (_in_row(s, j, i1) if isinstance(s, Tensor) else s for s in found[:3])
     eye = EYE.to(H)
-    S = rest * eye
+    S: Tensor = rest * eye
     if isinstance(W2, Tensor) or W2:
         S = S + 2 * W2 * (i1 * eye - e)
     if isinstance(p, Tensor) or p:  # else a collapsed body, C singular, has a stress too
