@@ -19,6 +19,7 @@ from dpl.fem.linear.condensation import (
     condense,
     condensed_layers,
     condensed_solves,
+    run_length,
     solve_layers,
 )
 from dpl.fem.linear.krylov import conjugate_gradients, conjugate_gradients_of_tensors
@@ -184,13 +185,13 @@ class LinearResponse:
 
     def by_parity(self, force: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return forces (B, N, D) and their linear solutions by parity, (B, M, m) float64 each."""
-        dofs, _, scales, characters, supports, _ = self._orbits(force.device)
+        runs, _, scales, characters, supports, _ = self._orbits(force.device)
         law = self.scene.problem.material.with_parameters(parameters)
         factors = self.terms.factors(law).double().expand(force.shape[0], -1)
         factors = pad(factors, (0, 1), value=1.0)
         with full_precision(force.device.type):
-            rows = force.double().flatten(1).index_select(1, dofs.flatten())
-            parts = characters @ (scales * rows.unflatten(1, dofs.shape))
+            rows = force.double().flatten(1).unflatten(1, (-1, self._run)).index_select(1, runs)
+            parts = characters @ (scales * rows.flatten(1).unflatten(1, scales.shape))
             right = parts.flatten(1) - factors @ supports
             if torch.compiler.is_compiling():
                 solved = self.by_tensors(right, factors)
@@ -203,8 +204,8 @@ class LinearResponse:
         _, signs, _, characters, _, places = self._orbits(parts.device)
         with full_precision(parts.device.type):
             values = signs * (characters.T @ parts)
-        fields = pad(values.flatten(1), (0, 1)).index_select(1, places)
-        return fields.unflatten(1, self.scene.problem.shape)
+        rows = pad(values.flatten(1), (0, self._run)).unflatten(1, (-1, self._run))
+        return rows.index_select(1, places).flatten(1).unflatten(1, self.scene.problem.shape)
 
     def solve(self, right: Tensor, factors: Tensor) -> Tensor:
         """Return K(0)^-1 f, (B, M m), of forces by parity, (B, M m), without derivatives.
@@ -222,7 +223,7 @@ class LinearResponse:
 
     def by_tensors(self, right: Tensor, factors: Tensor) -> Tensor:
         """Return the same as `solve` by tensor operations."""
-        layers, places, columns, entries = self.tensors(right.device)
+        layers, columns, entries = self.tensors(right.device)
         count = max(1, MAX_VALUES // max(columns.numel(), self.blocks.values.size))
         if not torch.compiler.is_compiling() and right.shape[0] > count:
             both = zip(right.split(count), factors.split(count), strict=True)
@@ -230,7 +231,7 @@ class LinearResponse:
 
         def of_node(f: Tensor) -> Tensor:
             forces = f.unflatten(1, (len(self.blocks.values), -1)).permute(2, 1, 0)
-            solved = solve_layers(layers, places, forces.to(layers[0].inverse.dtype))
+            solved = solve_layers(layers, forces.to(layers.layers[0].inverse.dtype))
             return solved.permute(2, 1, 0).flatten(1).double()
 
         if not self.terms.varies:
@@ -244,18 +245,28 @@ class LinearResponse:
         ends = self.terms.rtol, 2 * self.terms.bound
         return conjugate_gradients_of_tensors(product, of_node, right, *ends)
 
+    @cached_property
+    def _run(self) -> int:
+        """Length of the runs of degrees of freedom: 3 if nodes of a solid are free or held."""
+        dofs = self.orbits.dofs
+        return run_length(
+            dofs.ravel(), np.array(dofs.shape[1]), np.array(self.scene.problem.free.numel())
+        )
+
     def _orbits(self, device: torch.device) -> list[Tensor]:
         """Return dofs, signs, scales, characters and forces of supports, see `OrbitArrays`.
 
         The last one is the position of each degree of freedom among the images; M m of fixed ones.
+        Degrees of freedom and positions are those of runs, see `run_length`.
         """
 
         def make() -> list[Tensor]:
             characters, *arrays = self.orbits
             dofs, signs, scales = map(torch.from_numpy, arrays)
-            places = torch.full((self.scene.problem.free.numel(),), dofs.numel())
-            places[dofs.flatten()] = torch.arange(dofs.numel())
-            own = dofs, signs, scales, torch.from_numpy(characters), self._supports, places
+            runs = dofs.flatten()[:: self._run] // self._run
+            places = torch.full((self.scene.problem.free.numel() // self._run,), len(runs))
+            places[runs] = torch.arange(len(runs))
+            own = runs, signs, scales, torch.from_numpy(characters), self._supports, places
             return [part.to(device) for part in own]
 
         return self._on(device, "orbits", make)
@@ -265,7 +276,7 @@ class LinearResponse:
 
         def make() -> list[Any]:
             terms = self._matrices.padded() if self.terms.varies else (torch.zeros(0).long(),) * 2
-            return [*condensed_layers(self.blocks, device), *(part.to(device) for part in terms)]
+            return [condensed_layers(self.blocks, device), *(part.to(device) for part in terms)]
 
         return self._on(device, "blocks", make)
 
@@ -293,7 +304,7 @@ class _Solve(Function):
         right: Tensor = _Solve.apply(gradients[0], factors, ctx.response)
         of_factors = None
         if ctx.needs_input_grad[1] and ctx.response.terms.varies:
-            _, _, columns, entries = ctx.response.tensors(x.device)
+            _, columns, entries = ctx.response.tensors(x.device)
             of_factors = -torch.einsum("bn,bnw,knw->bk", right, x[:, columns], entries)
         return right, of_factors, None
 

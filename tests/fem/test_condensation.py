@@ -10,6 +10,7 @@ from dpl.fem.linear.condensation import (
     condense,
     condensed_layers,
     condensed_solves,
+    run_length,
     solve_layers,
 )
 from dpl.fem.linear.interface import SingularMatrix
@@ -46,6 +47,13 @@ def full():
     return csr_array(random @ random.T + 90 * np.eye(90)), random[:, :2]
 
 
+def three_at_each_node():
+    """Return a grid with three coupled unknowns at each node."""
+    matrix, points = laplacian((5, 6, 7))
+    coupling = np.array([[2, 1, 0], [1, 3, 1], [0, 1, 4]])
+    return csr_array(kron(matrix, coupling)), np.repeat(points, 3, axis=0)
+
+
 GRAPHS = {
     "line": laplacian((200,)),
     "plane": laplacian((15, 16)),
@@ -54,6 +62,7 @@ GRAPHS = {
     "ring": ring(300),
     "two parts": two_parts(),
     "full": full(),
+    "three unknowns at each node": three_at_each_node(),
 }
 
 
@@ -70,7 +79,7 @@ def test_all_solutions_equal_those_of_a_dense_factorisation(graph):
     random[:, 2] = np.arange(size) == size // 2  # one entry: fronts without forces are left out
     exact = np.linalg.solve(matrix.toarray(), random)
     right = torch.from_numpy(random)[:, None].expand(-1, 2, -1)
-    found = solve_layers(*condensed_layers(blocks, "cpu"), right).numpy()
+    found = solve_layers(condensed_layers(blocks, "cpu"), right).numpy()
     for k in range(2):
         assert norm((1 + k) * found[:, k] - exact) < 1e-11 * norm(exact)
     table, unknowns, *_ = blocks
@@ -87,8 +96,16 @@ def test_the_blocks_of_a_solid_are_smaller_than_its_inverse():
     matrix, points = GRAPHS["solid"]
     blocks = condense([matrix], points)
     assert blocks.values.size < 0.5 * matrix.shape[0] ** 2
-    for layer in condensed_layers(blocks, "cpu")[0]:
+    for layer in condensed_layers(blocks, "cpu").layers:
         assert torch.equal(layer.inverse, layer.inverse.mT)
+
+
+def test_unknowns_of_a_node_stay_together():
+    matrix, points = GRAPHS["three unknowns at each node"]
+    table, unknowns, *_ = condense([matrix], points)
+    assert run_length(unknowns, table[:, 1], table[:, 2]) == 3
+    assert run_length(unknowns, table[:, 1] - 1) == 1
+    assert run_length(unknowns + 1) == 1
 
 
 def test_an_indefinite_matrix_is_refused():

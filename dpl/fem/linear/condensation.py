@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from numba import float32, float64, int64, njit, void
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
@@ -41,6 +41,7 @@ def _dissect(
     points: NDArray[np.float64],
     unknowns: Integers,
     fronts: list[tuple[Integers, tuple[int, ...]]],
+    leaf: int,
 ) -> tuple[int, ...]:
     """Append pivots and children of the fronts of some unknowns; return the numbers of the roots.
 
@@ -52,12 +53,12 @@ def _dissect(
     count, part = connected_components(own, directed=False)
     if count > 1:
         pieces = (unknowns[part == k] for k in range(count))
-        return tuple(root for one in pieces for root in _dissect(graph, points, one, fronts))
-    side = _divide(own, points[unknowns]) if len(unknowns) > LEAF else None
+        return tuple(root for one in pieces for root in _dissect(graph, points, one, fronts, leaf))
+    side = _divide(own, points[unknowns]) if len(unknowns) > leaf else None
     children: tuple[int, ...] = ()
     if side is not None:
         for k in (-1, 1):
-            children += _dissect(graph, points, unknowns[side == k], fronts)
+            children += _dissect(graph, points, unknowns[side == k], fronts, leaf)
         unknowns = unknowns[side == 0]
     fronts.append((unknowns, children))
     return (len(fronts) - 1,)
@@ -101,15 +102,21 @@ class Condensed(NamedTuple):
 def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Condensed:
     """Return the blocks in float64 of P symmetric matrices, (n, n), of a similar structure.
 
-    The fronts are chosen by the points, (n, D), the positions of the unknowns. A matrix that is not
-    positive definite raises a `SingularMatrix`.
+    The fronts are chosen by the points, (n, D), the positions of the unknowns; unknowns of a node
+    stay together. A matrix that is not positive definite raises a `SingularMatrix`.
     """
-    graph = csr_array(sum(abs(matrix) for matrix in matrices))
+    run = next(r for r in (3, 2, 1) if np.array_equal(points, np.repeat(points[::r], r, axis=0)))
+    entries = coo_array(sum(abs(matrix) for matrix in matrices))
+    graph = csr_array((entries.data, (entries.row // run, entries.col // run)))  # of nodes
     tree: list[tuple[Integers, tuple[int, ...]]] = []
-    _dissect(graph, points, np.arange(graph.shape[0]), tree)
-    rank, position = np.empty((2, graph.shape[0]), np.int64)
+    _dissect(graph, points[::run], np.arange(graph.shape[0]), tree, LEAF // run)
+    rank, position = np.empty(graph.shape[0], np.int64), np.empty(len(points), np.int64)
     rank[np.concatenate([pivots for pivots, _ in tree])] = np.arange(len(rank))
     updates: dict[int, tuple[Integers, NDArray[np.float64]]] = {}  # boundaries and F there
+
+    def of_nodes(nodes: Integers) -> Integers:
+        return (run * nodes[:, None] + np.arange(run)).ravel()
+
     table, heights, unknowns, blocks = [], np.zeros(len(tree), np.int64), [], []
     first = place = 0
     for k, (pivots, children) in enumerate(tree):
@@ -117,14 +124,14 @@ def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Cond
         coupled = np.concatenate([graph[pivots].indices, *(boundary for boundary, _ in passed)])
         coupled = np.unique(coupled).astype(np.int64)
         boundary = coupled[rank[coupled] > rank[pivots].max()]
-        both, count = np.concatenate([pivots, boundary]), len(pivots)
+        both, count = of_nodes(np.concatenate([pivots, boundary])), run * len(pivots)
         F = np.zeros((len(matrices), len(both), len(both)))
         for own, matrix in zip(F, matrices, strict=True):
-            own[:count] = matrix[pivots][:, both].toarray()
+            own[:count] = matrix[both[:count]][:, both].toarray()
         F[:, count:, :count] = F[:, :count, count:].mT
         position[both] = np.arange(len(both))
         for inner, update in passed:
-            where = position[inner]
+            where = position[of_nodes(inner)]
             F[:, where[:, None], where] += update
         heights[k] = max((heights[child] + 1 for child in children), default=0)
         try:
@@ -264,25 +271,30 @@ def add_inverses(
 class Layer(NamedTuple):
     """Fronts of the same height and similar sizes, filled to one size; none depends on another."""
 
-    pivots: Tensor  # pivots of each front, n where there are fewer, (k I,)
-    received: Tensor  # positions of F_JI F_II^-1 f of layers before, w for each pivot, (w, k I)
-    boundary: Tensor  # positions among the solutions of layers behind, the last one first, (k, J)
+    received: Tensor  # positions of F_JI F_II^-1 f of layers before, (w, k I / c)
+    boundary: Tensor  # positions among solutions of layers behind, the last first, (k J / c,)
     inverse: Tensor  # F_II^-1 of P matrices, zero in filled rows and columns, (P, k, I, I)
     coupling: Tensor  # X, (P, k, I, J)
 
 
-def condensed_layers(blocks: Condensed, device: torch.device | str) -> tuple[list[Layer], Tensor]:
-    """Return the blocks on a device, in their dtype, and the position of each solution, (n,).
+class Layers(NamedTuple):
+    """Blocks as layers, those without children first; positions are those of c unknowns each."""
 
-    Fronts without children come first.
-    """
+    layers: list[Layer]
+    pivots: Tensor  # of one layer after the other, n / c where there are fewer
+    places: Tensor  # of each solution, (n / c,)
+
+
+def condensed_layers(blocks: Condensed, device: torch.device | str) -> Layers:
+    """Return the blocks on a device, in their dtype."""
     table, unknowns, heights, values = blocks
+    run = run_length(unknowns, table[:, 1], table[:, 2])
     size, widths = len(np.unique(unknowns)), np.diff(table[:, :3])  # numbers of pivots, boundary
-    kinds = np.stack([heights, np.rint(2 * np.log2(widths[:, 0])).astype(int)], axis=1)
+    kinds = np.stack([heights, np.rint(np.log2(widths[:, 0])).astype(int)], axis=1)
     layers = []
     for kind in np.unique(kinds, axis=0):  # one height, similar numbers of pivots
         chosen = np.flatnonzero((kinds == kind).all(axis=1))
-        count, others = np.maximum(widths[chosen].max(axis=0), 1)  # graphs have no empty tensors
+        count, others = widths[chosen].max(axis=0)
         pivots, boundary = (np.full((len(chosen), width), size) for width in (count, others))
         inverse = np.zeros((len(values), len(chosen), count, count), values.dtype)
         coupling = np.zeros((len(values), len(chosen), count, others), values.dtype)
@@ -293,18 +305,34 @@ def condensed_layers(blocks: Condensed, device: torch.device | str) -> tuple[lis
             square, rest = np.split(block, [own * own], axis=1)
             inverse[:, k, :own, :own] = square.reshape(len(values), own, own)
             coupling[:, k, :own, :other] = rest.reshape(len(values), own, other)
-        layers.append((pivots.ravel(), boundary, inverse, coupling))
-    every = [np.concatenate([[size], *(layer[k].ravel() for layer in layers)]) for k in (0, 1)]
-    received, solved = _positions(every[1], size), np.zeros(size + 1, np.int64)
-    behind = np.concatenate([[size], *(pivots for pivots, *_ in reversed(layers))])
+        runs = (part.ravel()[::run] // run for part in (pivots, boundary))
+        layers.append((*runs, inverse, coupling))
+    none, size = np.array([size // run]), size // run
+    received = _positions(np.concatenate([none, *(layer[1] for layer in layers)]), size)
+    behind = np.concatenate([none, *(layer[0] for layer in layers[::-1])])
+    solved = np.zeros(size + 1, np.int64)
     solved[behind[::-1]] = np.arange(len(behind))[::-1]  # the n-th unknown is the first one, zero
     found = []
     for pivots, boundary, *matrices in layers:
         rows = received[pivots]
         rows = rows[:, : int((rows > 0).sum(axis=1).max())].T.copy()
-        arrays = pivots, rows, solved[boundary], *matrices
+        arrays = rows, solved[boundary], *matrices
         found.append(Layer(*(torch.from_numpy(array).to(device) for array in arrays)))
-    return found, torch.from_numpy(solved[:-1]).to(device)
+    ends = np.concatenate([layer[0] for layer in layers]), solved[:-1]
+    return Layers(found, *(torch.from_numpy(array).to(device) for array in ends))
+
+
+def run_length(positions: Integers, *ends: Integers) -> int:
+    """Return the largest length up to 3 of runs of which positions consist, each from a multiple.
+
+    The ends of parts of them are ends of runs. Rows of whole runs are selected faster.
+    """
+    for run in (3, 2):
+        if all((end % run == 0).all() for end in (np.array([len(positions)]), *ends)):
+            own = positions.reshape(-1, run)
+            if (own == run * (own[:, :1] // run) + np.arange(run)).all():
+                return run
+    return 1
 
 
 def _positions(names: Integers, count: int) -> Integers:
@@ -317,26 +345,33 @@ def _positions(names: Integers, count: int) -> Integers:
     return rows
 
 
-def solve_layers(layers: Sequence[Layer], places: Tensor, right: Tensor) -> Tensor:
+def solve_layers(blocks: Layers, right: Tensor) -> Tensor:
     """Return the solutions (n, P, B) of right-hand sides (n, P, B) of the dtype of the blocks.
 
-    The first arguments are those of `condensed_layers`. Each layer is a product of batches of
-    matrices, for batches, gradients, GPUs and graphs. The unknowns are the first axis, whose rows
-    onnxruntime copies whole, and the batch is the last one, so that one load is a column.
+    Each layer is a product of batches of matrices, for batches, gradients, GPUs and graphs. The
+    unknowns are the first axis, whose rows onnxruntime copies whole, and the batch is the last one,
+    so that one load is a column.
     """
+    right = right.unflatten(0, (len(blocks.places), -1))  # (n / c, c, P, B)
     zero = torch.zeros_like(right[:1])
-    force, passed, solved, inner = torch.cat([right, zero]), zero, zero, []
-    for layer in layers:
-        own = force.index_select(0, layer.pivots)
+    forces = torch.cat([right, zero]).index_select(0, blocks.pivots).flatten(0, 1)
+    sizes = [layer.inverse[0, :, 0].numel() for layer in blocks.layers]
+    passed, solved, inner = zero, zero, []
+    for layer, own in zip(blocks.layers, forces.split(sizes), strict=True):
         if len(layer.received):
             terms = passed.index_select(0, layer.received.flatten())
-            own = own - terms.unflatten(0, layer.received.shape).sum(0)
+            own = own - terms.unflatten(0, layer.received.shape).sum(0).flatten(0, 1)
         own = own.unflatten(0, layer.inverse.shape[1:3])  # (k, I, P, B)
         inner.append(layer.inverse @ own.permute(2, 0, 1, 3))
-        terms = own.permute(2, 0, 3, 1) @ layer.coupling  # (P, k, B, J)
-        passed = torch.cat([passed, terms.permute(1, 3, 0, 2).flatten(0, 1)])
-    for layer, own in zip(reversed(layers), reversed(inner), strict=True):
-        outer = solved.index_select(0, layer.boundary.flatten()).transpose(0, 1)
-        found = own - layer.coupling @ outer.unflatten(1, layer.boundary.shape)
-        solved = torch.cat([solved, found.flatten(1, 2).transpose(0, 1)])
-    return solved.index_select(0, places)
+        if len(layer.boundary):
+            terms = own.permute(2, 0, 3, 1) @ layer.coupling  # (P, k, B, J)
+            terms = terms.permute(1, 3, 0, 2).reshape(-1, *zero.shape[1:])
+            passed = torch.cat([passed, terms])
+    for layer, own in zip(reversed(blocks.layers), reversed(inner), strict=True):
+        if len(layer.boundary):
+            outer = solved.index_select(0, layer.boundary).flatten(0, 1)
+            shape = layer.coupling.shape[1], layer.coupling.shape[3]
+            own = own - layer.coupling @ outer.unflatten(0, shape).permute(2, 0, 1, 3)
+        found = own.permute(1, 2, 0, 3).reshape(-1, *zero.shape[1:])
+        solved = torch.cat([solved, found])
+    return solved.index_select(0, blocks.places).flatten(0, 1)

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dpl.fem.materials.tensors import product
+from dpl.fem.materials.rows import in_rows, product, transposed
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
 
@@ -12,7 +12,7 @@ SERIES_ANGLE = 0.3  # rotation angle below which sin(t)/t - 1 is its series [rad
 
 
 def rotated_strain(H: Tensor) -> Tensor:
-    """Return exp(W) (I + e) - I - H, (..., 3, 3), with H = e + W, e symmetric and W skew.
+    """Return exp(W) (I + e) - I - H of H = e + W, e symmetric and W skew, in rows (..., 9, c).
 
     The displacement gradient of the strain e in the frame rotated by W, minus that of the linear
     theory: of second order in H.
@@ -20,8 +20,9 @@ def rotated_strain(H: Tensor) -> Tensor:
     Source: Huang, Tong, Zhou, Bao, Desbrun (2011), Interactive shape interpolation through
     controllable dynamic deformation, IEEE TVCG 17 (rotation-strain coordinates).
     """
-    W, e = (H - H.mT) / 2, (H + H.mT) / 2
-    square = (W * W).sum(dim=(-2, -1), keepdim=True) / 2  # of the angle
+    other = transposed(H)
+    W, e = (H - other) / 2, (H + other) / 2
+    square = W.square().sum(dim=-2, keepdim=True) / 2  # of the angle
     small = square < SERIES_ANGLE**2
     angle = torch.where(small, 1.0, square).sqrt()
     series = -square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
@@ -52,7 +53,7 @@ def warped_solution(solver: LinearSolver, load: Load) -> Tensor:
     volumes, cells, dim = problem.dV.sum(dim=1), problem.cells, problem.shape[1]
     mean = (problem.dN * problem.dV[..., None, None]).sum(dim=1)  # times the volume, (E or 1, A, D)
     H = linear[cells].mT @ (mean / volumes[:, None, None])
-    change = rotated_strain(pad(H, (0, 3 - dim, 0, 3 - dim)))
+    change = rotated_strain(in_rows(pad(H, (0, 3 - dim, 0, 3 - dim)))).mT.unflatten(-1, (3, 3))
     stress = problem.material.centred().rest_stress(change[None, :, None])[0, :, 0, :dim, :dim]
     parts = (mean @ stress.mT).flatten(0, 1)  # nodal forces of the cells
     force = torch.zeros_like(linear).index_add_(0, cells.flatten(), parts)

@@ -1,7 +1,8 @@
 """Nonlinear strain and unbalanced stress at a few sample cells of a body.
 
-All functions take displacement gradients H = du/dX (..., 3, 3), in 2D padded with zeros, and are
-differentiable tensor operations that keep their relative accuracy for small H.
+All functions take displacement gradients H = du/dX (..., 3, 3), in 2D padded with zeros, or rows of
+their entries, and are differentiable tensor operations that keep their relative accuracy for small
+H. In rows, (..., 9, c), work runs along cells, and graphs have few nodes.
 """
 
 from typing import NamedTuple
@@ -10,19 +11,21 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from dpl.fem.materials.heterogeneous import one_law
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import Material
-from dpl.fem.materials.tensors import product, volume_change
+from dpl.fem.materials.rows import (
+    EYE,
+    TRANSPOSED,
+    in_rows,
+    invariants,
+    minors,
+    product,
+    transposed,
+)
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.rotation_strain import rotated_strain
 from dpl.models.unrolled.feature_loops import MIN_VOLUME_RATIO, POLAR_ITER
-
-# entries (i+1, j+1), (i+2, j+2), (i+1, j+2), (i+2, j+1) modulo 3 of a matrix, (4, 9)
-MINORS = torch.tensor(
-    [
-        [3 * ((i + di) % 3) + (j + dj) % 3 for i in range(3) for j in range(3)]
-        for di, dj in ((1, 1), (2, 2), (1, 2), (2, 1))
-    ]
-)
 
 
 class SampleCells(NamedTuple):
@@ -47,13 +50,13 @@ class SampleCells(NamedTuple):
     def first_features(self, linear: Tensor) -> Tensor:
         """Return `rotated_strain`, (B, C, 1, D, D), of the linear solution's H (B, C, 3, 3)."""
         D = self.gradients.shape[-1]
-        return rotated_strain(linear)[:, :, None, :D, :D]
+        return rotated_strain(in_rows(linear)).mT.unflatten(-1, (1, 3, 3))[..., :D, :D]
 
     def features(self, law: Material, coordinates: Tensor, linear: Tensor) -> Tensor:
         """Return `unbalanced_stress` (B, C, 2, D, D) of c (B, R) and the linear H (B, C, 3, 3)."""
-        D = self.gradients.shape[-1]
-        H = self.gradient(coordinates)
-        return unbalanced_stress(law, H[:, :, None], linear[:, :, None])[:, :, 0, :, :D, :D]
+        D, rest = self.gradients.shape[-1], law.rest_stress(linear[:, :, None])[:, :, 0]
+        rows = unbalanced_stress(law, in_rows(self.gradient(coordinates)), in_rows(rest))
+        return rows.mT.unflatten(-1, (2, 3, 3))[..., :D, :D]
 
 
 def cell_gradients(problem: Problem, fields: Tensor, cells: Tensor) -> Tensor:
@@ -87,33 +90,72 @@ def mechanical_maps(
     return [part.flatten(1).T @ inverse for part in weighted]
 
 
-def unbalanced_stress(law: Material, H: Tensor, linear: Tensor) -> Tensor:
-    """Return [R^T dP, dP], (..., 2, 3, 3), with dP = P(H) - P(0) - A(0) : linear.
+def unbalanced_stress(law: Material, H: Tensor, rest: Tensor) -> Tensor:
+    """Return [R^T dP, dP] in rows, (B, ..., 18, c), with dP = P(H) - P(0) - A(0) : linear.
 
     P(0) is in equilibrium, and A(0) : linear is in equilibrium with the load, so that dP is the
     stress which is not. R is the rotation of F = I + H (polar decomposition). Where det F is below
     `MIN_VOLUME_RATIO`, H counts as zero, so that the result is finite.
 
     Args:
-        law: The law; of a batch, H is (B, C, 1, 3, 3).
-        H: Displacement gradient.
-        linear: Displacement gradient of the linear solution.
+        law: The law of the C cells.
+        H: Displacement gradients in rows, (B, ..., 9, c).
+        rest: A(0) : H of the linear solution in rows, (B, ..., 9, c).
     """
-    valid = volume_change(H) > MIN_VOLUME_RATIO - 1
-    H = torch.where(valid[..., None, None], H, 0.0)
-    stress = law.stress(H) - law.residual_stress(H) - law.rest_stress(linear)
-    return torch.stack([product(rotation(H).mT, stress), stress], dim=-3)
+    first, second, third, _ = invariants(H)
+    change = first + second + third
+    valid = change > MIN_VOLUME_RATIO - 1
+    H, change = torch.where(valid, H, 0.0), torch.where(valid, change, 0.0)
+    stress = _stress(law, H, change) - rest
+    return torch.cat([product(_rotation(H), stress, TRANSPOSED), stress], dim=-2)
 
 
-def rotation(H: Tensor) -> Tensor:
-    """Return the rotation R (..., 3, 3) of F = I + H, det F > 0.
+def at_points(rows: Tensor) -> Tensor:
+    """Return rows (B, ..., k, c) as values of one point of each cell, (B, C, 1, k), C = ... c."""
+    return rows.mT.flatten(1, -2)[:, :, None]
+
+
+def _stress(law: Material, H: Tensor, change: Tensor) -> Tensor:
+    """Return P(H) - P(0) in rows of H in rows, det F = 1 + change; see `InvariantBasedMaterial`.
+
+    I - X = 2 E X is taken from the cofactors of 2 E, in which no terms cancel.
+    """
+    law = one_law(law)
+    if not isinstance(law, InvariantBasedMaterial):
+        at = at_points(H).unflatten(-1, (3, 3))
+        points = law.stress(at) - law.residual_stress(at)
+        return points.flatten(-2)[:, :, 0].reshape(H.mT.shape).mT
+    e = H + transposed(H)
+    e = e + product(H, H, TRANSPOSED) if law.finite else e
+    i1, second, third, cofactor = invariants(e)
+    j, first, other = (s.flatten(1).unsqueeze(-1) for s in (change, i1, 2 * i1 + second))
+    log_j = torch.log1p(j)
+    m1 = torch.expm1(-2 / 3 * log_j)
+    found = law.invariant_derivatives(law.constants, first, other, j, log_j, m1)
+    rest, W2, p = (_in_row(s, j, i1) if isinstance(s, Tensor) else s for s in found[:3])
+    eye = EYE.to(H)
+    S: Tensor = rest * eye
+    if isinstance(W2, Tensor) or W2:
+        S = S + 2 * W2 * (i1 * eye - e)
+    if isinstance(p, Tensor) or p:  # else a collapsed body, C singular, has a stress too
+        beyond = second + third
+        S = S + p / (1 + i1 + beyond) * (cofactor - e - beyond * eye)
+    return S + product(H, S) if law.finite else S
+
+
+def _in_row(values: Tensor, points: Tensor, row: Tensor) -> Tensor:
+    """Return values that broadcast with `points`, (B, C, 1), in the shape of `row`."""
+    is_whole = values.shape[1:] == points.shape[1:]  # graphs need no copy of them
+    return (values if is_whole else values.expand_as(points)).reshape(row.shape)
+
+
+def _rotation(H: Tensor) -> Tensor:
+    """Return the rotation R of F = I + H, det F > 0, all in rows.
 
     Source: Higham (1986), SIAM J. Sci. Stat. Comput. 7: X <- (X + X^-T) / 2.
     """
-    F = H + torch.eye(3, dtype=H.dtype, device=H.device)
-    X = F.flatten(-2).movedim(-1, 0)  # components first: work runs along rows, graphs are small
+    X = H + EYE.to(H)
     for _ in range(POLAR_ITER):
-        a, b, c, d = (X.index_select(0, rows) for rows in MINORS.to(H.device))
-        minors = a * b - c * d
-        X = (X + minors / (X[:3] * minors[:3]).sum(dim=0)) / 2
-    return X.movedim(0, -1).unflatten(-1, (3, 3))
+        cofactor = minors(X)
+        X = 0.5 * X + cofactor * (1.5 / (X * cofactor).sum(dim=-2, keepdim=True))
+    return X

@@ -23,7 +23,7 @@ from dpl.models.unrolled.compiled import LawArguments, law_arguments, model_arra
 from dpl.models.unrolled.correction import LOADS, choose_newton, fit_errors, relative_errors
 from dpl.models.unrolled.fit import fit_in_best_modes, sampled_terms
 from dpl.models.unrolled.loops import ModelArrays, predict
-from dpl.models.unrolled.products import Tensors, nonlinear_coordinates
+from dpl.models.unrolled.products import Tensors, in_rows, nonlinear_coordinates
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 from dpl.system.threads import on_threads
@@ -256,8 +256,8 @@ class Unrolled(StoredBuffers):
             return torch.from_numpy(array).to(device)
 
         orbits = OrbitArrays(*map(on_device, arrays.orbits))
-        modes = arrays.modes.astype(self.linear.blocks.values.dtype)
-        model = ModelArrays(orbits, *map(on_device, arrays[1:]))._replace(modes=on_device(modes))
+        modes = on_device(arrays.modes.astype(self.linear.blocks.values.dtype))
+        model = in_rows(ModelArrays(orbits, *map(on_device, arrays[1:])))._replace(modes=modes)
         law = self.terms.problem.material.of_cells(self.cells.cpu()[cells]).centred()
         places = on_device(arrays.columns.ravel().argsort()[: self.modes.shape[1]])
         found = model, law, places

@@ -15,6 +15,7 @@ from dpl.models.unrolled import features
 from dpl.models.unrolled.fit import limit_step
 
 Tensors = Any  # `dpl.models.unrolled.loops.ModelArrays` of tensors
+ONE_TENSOR = "gradients", "rest", "entry_signs", "first_signs", "first_map"
 BOTH = (0, 1)  # axes of coordinates by parity, (M, r, B)
 
 
@@ -29,33 +30,40 @@ def nonlinear_coordinates(model: Tensors, law: Material, linear: Tensor) -> tupl
         linear: Coordinates of Galerkin linear solutions, (M, r, B).
     """
     H = _gradients(model, linear)
-    proposed = _coordinates(model, model.first_map, model.first_signs, features.rotated_strain(H))
+    cells = features.at_points(H).unflatten(-1, (3, 3))
+    rest = law.rest_stress(cells).flatten(-2)[:, :, 0].reshape(H.mT.shape).mT
+    strain = features.rotated_strain(H)
+    proposed = _coordinates(model, model.first_map, model.first_signs, strain)
     c = step = limit_step(proposed, linear, model.limits[0], BOTH)
     steps = [linear, step]
     for matrix, limit in zip(model.maps, model.limits[1:], strict=True):
-        stress = features.unbalanced_stress(law, _gradients(model, linear + c), H)[:, :, 0]
+        stress = features.unbalanced_stress(law, _gradients(model, linear + c), rest)
         step = limit_step(_coordinates(model, matrix, model.map_signs, stress), step, limit, BOTH)
         c = c + step
         steps.append(step)
     return c, torch.stack(steps).norm(dim=(1, 2)).T
 
 
+def in_rows(model: Tensors) -> Tensors:
+    """Return a model whose b entries at the sample cells are 9 rows of all cells, or 18."""
+
+    def moved(values: Tensor, count: int) -> Tensor:
+        return values.unflatten(-1, (-1, count, SIMD_WIDTH)).transpose(-3, -2).flatten(-3)
+
+    one = {name: moved(getattr(model, name), 9) for name in ONE_TENSOR}
+    two = {name: moved(getattr(model, name), 18) for name in ("map_signs", "maps")}
+    return model._replace(**one, **two)
+
+
 def _gradients(model: Tensors, c: Tensor) -> Tensor:
-    """Return H at the sample cells, (B, C, 1, 3, 3), of coordinates (M, r, B)."""
-    characters = model.orbits.characters
-    parts = model.gradients.mT.to(c) @ c
-    joined: Tensor = characters.T @ parts.flatten(1)
-    images = model.entry_signs[..., None] * joined.view_as(parts)  # (M, b, B)
-    H: Tensor = model.rest[..., None] + images
-    blocks = H.unflatten(1, (-1, 9, SIMD_WIDTH))
-    return blocks.permute(4, 0, 1, 3, 2).reshape(H.shape[-1], -1, 1, 3, 3)
+    """Return H at the sample cells in rows, (B, M, 9, C / M), of coordinates (M, r, B)."""
+    parts = (model.gradients.mT.to(c) @ c).permute(2, 0, 1)  # (B, M, b)
+    images = model.entry_signs * (model.orbits.characters.T @ parts)
+    H: Tensor = (model.rest + images).unflatten(2, (9, -1))
+    return H
 
 
-def _coordinates(model: Tensors, matrix: Tensor, signs: Tensor, found: Tensor) -> Tensor:
-    """Return coordinates (M, r, B) of F features (B, C, F, 3, 3) at the sample cells."""
-    characters = model.orbits.characters
-    shape = found.shape[0], len(signs), -1, SIMD_WIDTH, found[0, 0].numel()
-    rows = found.reshape(shape).permute(1, 2, 4, 3, 0).flatten(1, 3)  # (M, F b, B)
-    images = signs[..., None] * rows
-    parts: Tensor = characters @ images.flatten(1)
-    return matrix.to(images) @ parts.view_as(images)
+def _coordinates(model: Tensors, matrix: Tensor, signs: Tensor, rows: Tensor) -> Tensor:
+    """Return coordinates (M, r, B) of features at the sample cells in rows, (B, M, k, C / M)."""
+    parts: Tensor = model.orbits.characters @ (signs * rows.flatten(2))
+    return matrix.to(parts) @ parts.permute(1, 2, 0)
