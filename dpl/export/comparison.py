@@ -16,7 +16,7 @@ from dpl.training import TrainedSurrogate
 
 CHECK_STREAM = (0, 11)  # random stream of the loads of the comparison
 IN_RANGE = "in range"
-AMPLITUDES = {"small": 1e-3, "tiny": 1e-9, "large": 10.0}  # factors on loads in the training range
+AMPLITUDES = {"small": 1e-3, "tiny": 1e-9, "large": 3.0}  # factors on loads in the training range
 REPEATS = 3  # calls with each load whose times are measured
 N_OUTSIDE = 4  # loads of each kind outside the training range
 

@@ -8,15 +8,20 @@ from torch import Tensor, nn
 
 from dpl.fem import Load
 from dpl.fem.loads.family import MAX_DISTANCE, LoadFamily
+from dpl.fem.loads.file import FileLoads
 from dpl.fem.loads.fit import EDGE
+from dpl.fem.loads.mixture import MixtureLoads
 from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.loads.patch import PatchLoads
 from dpl.fem.loads.sized import CombinedLoads, VectorLoads
 from dpl.inference.answer import ROUNDOFF
 from dpl.training import TrainedSurrogate
 
 RIDGE = 1e-10  # of normal equations over their largest diagonal entry [-]
 BODY_NUMBERS = ("residual", "min_det_F")  # which need all cells
-NUMBERS = ("error", "amplitude", *BODY_NUMBERS)  # of each load
+LOAD_NUMBERS = ("error", "amplitude")  # which need the range of the loads
+NUMBERS = (*LOAD_NUMBERS, *BODY_NUMBERS)  # of each load
+SEARCHING = FileLoads, MixtureLoads, PatchLoads  # families whose `project` a graph cannot contain
 
 
 class Quantities(nn.Module):
@@ -29,12 +34,19 @@ class Quantities(nn.Module):
     """
 
     def __init__(self, surrogate: TrainedSurrogate, names: Iterable[str]) -> None:
-        """Take a surrogate and names of numbers; a residual of a body with ranges is refused."""
+        """Take a surrogate and names of numbers; numbers that a graph cannot have are refused."""
         super().__init__()
         self.surrogate, self.names = surrogate, tuple(names)
         if "residual" in self.names:
             surrogate.scene.problem.material.require_known("numbers = residual")
-        ranges = list(surrogate.scene.loads.parameter_ranges)
+        loads = surrogate.scene.loads
+        refused = [name for name in self.names if name in LOAD_NUMBERS]
+        if refused and isinstance(loads, SEARCHING):
+            raise ValueError(
+                f"numbers = {', '.join(refused)} must be left out for {type(loads).__name__}: "
+                "graphs do not contain its range"
+            )
+        ranges = list(loads.parameter_ranges)
         if ranges and (refused := [name for name in self.names if name in BODY_NUMBERS]):
             raise ValueError(
                 f"numbers = {', '.join(refused)} must be evaluated without ranges {ranges}; leave "

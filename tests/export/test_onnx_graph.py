@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -192,6 +193,15 @@ def test_residuals_of_a_body_with_ranges_are_refused(make_scene):
     surrogate = make_surrogate(FCNN, make_scene(poisson=[0.2, 0.4]), width=16)
     with pytest.raises(ValueError, match=r"^numbers = residual must be evaluated without ranges"):
         Quantities(surrogate, ["error", "residual"])
+
+
+def test_numbers_that_need_the_range_of_searched_loads_are_refused(make_scene):
+    scene = make_scene()
+    patches = replace(scene, loads=fem.PatchLoads(scene.linear))
+    surrogate = make_surrogate(FCNN, patches, width=16)
+    Quantities(surrogate, ["min_det_F"])
+    with pytest.raises(ValueError, match=r"^numbers = error must be left out for PatchLoads"):
+        Quantities(surrogate, ["min_det_F", "error"])
 
 
 def test_amplitudes_are_those_of_the_family(make_scene):
