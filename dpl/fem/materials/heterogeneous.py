@@ -156,6 +156,10 @@ class Heterogeneous(Material):
     def tangent(self, H: Tensor) -> Tensor:
         return self._of_all_cells("tangent", H)
 
+    @property
+    def has_residual_stress(self) -> bool:
+        return any(law.has_residual_stress for law in self.laws.values())
+
     def residual_stress(self, H: Tensor) -> Tensor:
         return self._of_all_cells("residual_stress", H)
 

@@ -194,6 +194,11 @@ class Material(Parametrised):
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
         return with_axes(self.mu, 2) * (H + H.mT) + pressure[..., None, None] * eye
 
+    @property
+    def has_residual_stress(self) -> bool:
+        """True if `residual_stress` is not zero."""
+        return False
+
     def residual_stress(self, H: Tensor) -> Tensor:
         """Return P(0) over E, (..., 3, 3) [-], at the points of H (..., 3, 3)."""
         return torch.zeros_like(H)

@@ -137,6 +137,10 @@ class Prestretched(Material):
     def point_bulk(self) -> Tensor:
         return self.law.point_bulk
 
+    @property
+    def has_residual_stress(self) -> bool:
+        return True
+
     def residual_stress(self, H: Tensor) -> Tensor:
         return self._at_rest[0].to(H)
 

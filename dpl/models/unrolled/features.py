@@ -5,6 +5,7 @@ their entries, and are differentiable tensor operations that keep their relative
 H. In rows, (..., 9, c), work runs along cells, and graphs have few nodes.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -110,9 +111,10 @@ def unbalanced_stress(law: Material, H: Tensor, rest: Tensor) -> Tensor:
     return torch.cat([product(_rotation(H), stress, TRANSPOSED), stress], dim=-2)
 
 
-def at_points(rows: Tensor) -> Tensor:
-    """Return rows (B, ..., k, c) as values of one point of each cell, (B, C, 1, k), C = ... c."""
-    return rows.mT.flatten(1, -2)[:, :, None]
+def by_points(function: Callable[[Tensor], Tensor], H: Tensor) -> Tensor:
+    """Return a function of one point of each cell, (B, C, 1, 3, 3), at H in rows, in rows."""
+    found = function(H.mT.flatten(1, -2).unflatten(-1, (3, 3))[:, :, None])
+    return found.flatten(-2)[:, :, 0].reshape(H.mT.shape).mT
 
 
 def _stress(law: Material, H: Tensor, change: Tensor) -> Tensor:
@@ -122,9 +124,7 @@ def _stress(law: Material, H: Tensor, change: Tensor) -> Tensor:
     """
     law = one_law(law)
     if not isinstance(law, InvariantBasedMaterial):
-        at = at_points(H).unflatten(-1, (3, 3))
-        points = law.stress(at) - law.residual_stress(at)
-        return points.flatten(-2)[:, :, 0].reshape(H.mT.shape).mT
+        return by_points(lambda at: law.stress(at) - law.residual_stress(at), H)
     e = H + transposed(H)
     e = e + product(H, H, TRANSPOSED) if law.finite else e
     i1, second, third, cofactor = invariants(e)

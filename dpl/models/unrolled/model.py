@@ -146,10 +146,8 @@ class Unrolled(StoredBuffers):
         self._has_loops = isinstance(one_law(problem.reference.material), InvariantBasedMaterial)
         for name, (shape, dtype) in self._layout().items():
             self.register_buffer(name, torch.zeros(shape, dtype=dtype))
-        self._stiffness = ReducedStiffness(self.stiffness, self.terms)
-        self._kept: dict[torch.device, tuple[Tensors, Material, Tensor]] = {}
-        self._last: tuple[Tensor, tuple[LawArguments, Array, Solve]] | None = None
         self.register_buffer("prescribed", problem.prescribed, persistent=False)
+        self._prepare()
 
     def _layout(
         self, modes: int = 0, cells: int = 0, maps: int = 0, newton_modes: int = 0, newton: int = 0
@@ -241,8 +239,8 @@ class Unrolled(StoredBuffers):
         """Prepare what follows from the buffers."""
         parts = self.stiffness.detach().cpu().clone()
         self._stiffness = ReducedStiffness(parts, self.terms)
-        self._last = None
-        self._kept = {}
+        self._last: tuple[Tensor, tuple[LawArguments, Array, Solve]] | None = None
+        self._kept: dict[torch.device, tuple[Tensors, Material, Tensor]] = {}
         for name in ("_doubt", "_arrays"):
             self.__dict__.pop(name, None)
 
@@ -270,9 +268,8 @@ class Unrolled(StoredBuffers):
         tracing = torch.compiler.is_compiling() or torch.jit.is_tracing()
         if tracing or force.device.type != "cpu" or force.dtype != torch.float64:
             return False
-        wants_gradient = force.requires_grad or parameters.requires_grad
-        differentiable = torch.is_grad_enabled() and wants_gradient
-        return self.is_fitted and not differentiable and self._has_loops
+        tracked = torch.is_grad_enabled() and (force.requires_grad or parameters.requires_grad)
+        return self.is_fitted and self._has_loops and not tracked
 
     def _compiled_fields(self, force: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return the same as `_fields` by compiled loops, on the threads of torch."""
@@ -387,9 +384,8 @@ class Unrolled(StoredBuffers):
         self._prepare()
 
     def check_buffers(self) -> None:
-        problem = self.scene.problem
-        count, cells = len(problem.cells), self.cells
-        check_indices(count, cells=cells, newton_cells=self.newton_cells)
+        problem, cells = self.scene.problem, self.cells
+        check_indices(len(problem.cells), cells=cells, newton_cells=self.newton_cells)
         parities = Parities.of(self.group, problem.shape[1])
         check_indices(len(parities.members), parity=self.parity)
         images = self.group.cell_images(problem)[:, cells.cpu()]

@@ -30,8 +30,7 @@ def nonlinear_coordinates(model: Tensors, law: Material, linear: Tensor) -> tupl
         linear: Coordinates of Galerkin linear solutions, (M, r, B).
     """
     H = _gradients(model, linear)
-    cells = features.at_points(H).unflatten(-1, (3, 3))
-    rest = law.rest_stress(cells).flatten(-2)[:, :, 0].reshape(H.mT.shape).mT
+    rest = features.by_points(law.rest_stress, H)
     strain = features.rotated_strain(H)
     proposed = _coordinates(model, model.first_map, model.first_signs, strain)
     c = step = limit_step(proposed, linear, model.limits[0], BOTH)
