@@ -123,7 +123,14 @@ def _model(net: Unrolled) -> Arrays:
     orbits, own = arrays.orbits, arrays._asdict()
     del own["orbits"]
     law, inverse, _ = net._at(torch.zeros(1, 0))
-    table, unknowns, _, values = linear.blocks
+    table, unknowns, *_ = linear.blocks
+    count, fronts = len(linear.blocks.values), range(len(table))
+    blocks = [
+        [np.hstack([a.T.ravel(), b.ravel()]) for a, b in (linear.blocks.front(p, k) for k in fronts)]
+        for p in range(count)
+    ]
+    sizes = [len(block) for block in blocks[0]]
+    table = np.concatenate([table[:, :3], np.cumsum([0, *sizes[:-1]])[:, None]], axis=1)
     factors = np.append(linear.terms.factors(net.scene.problem.material)[0].numpy(), 1.0)
     return {
         **orbits._asdict(),
@@ -135,7 +142,7 @@ def _model(net: Unrolled) -> Arrays:
         "law_samples": law[1],
         "front_table": table,
         "front_unknowns": unknowns.astype(np.int32),
-        "blocks": values,
+        "blocks": np.stack([np.concatenate(own) for own in blocks]).astype(np.float32),
         "error_factor": np.array(net._doubt * math.exp(net.error_factors[0])),
         "error_exponents": net.error_exponents[0].numpy(),
         "least_sizes": net.least_sizes.numpy(),

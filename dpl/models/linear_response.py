@@ -18,7 +18,8 @@ from dpl.fem.linear.condensation import (
     Condensed,
     condense,
     condensed_layers,
-    condensed_solves,
+    condensed_solutions,
+    rounded,
     run_length,
     solve_layers,
 )
@@ -34,7 +35,7 @@ from dpl.system.threads import on_threads
 Array = NDArray[np.float64]
 Parts = NDArray[Any]  # values by parity in the type of the blocks, (M, m)
 Solve = Callable[[Array], tuple[float, Parts, Parts]]  # see `LinearResponse.at`
-MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are float32 [-]
+MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are rounded [-]
 FEW = 8  # loads that compiled loops solve faster than products of matrices do
 MAX_VALUES = 2**26  # of a batch that are computed at a time by tensor operations
 
@@ -80,17 +81,17 @@ class LinearResponse:
 
     @cached_property
     def blocks(self) -> Condensed:
-        """Blocks of the node, one matrix for each of M parities, values (M, V) in float32.
+        """Blocks of the node, one matrix for each of M parities, `rounded`.
 
         They are float64 if the solutions of random forces lose more than `MAX_ROUNDING`.
         """
         matrices, points = self.form.matrices(self.terms.node_body), self.form.points
         exact = condense(matrices, points)
-        rounded = exact._replace(values=exact.values.astype(np.float32))
+        found = rounded(exact, self._supports.numpy().reshape(-1, len(matrices), len(points)))
         forces = np.random.default_rng(0).standard_normal((len(matrices), len(points)))
-        one, other = (_solutions(blocks, forces).astype(float) for blocks in (rounded, exact))
-        loss = norm(one - other, axis=1) / norm(other, axis=1)
-        return rounded if loss.max() < MAX_ROUNDING else exact
+        one, other = (condensed_solutions(blocks, forces) for blocks in (found, exact))
+        loss = norm(one.astype(float) - other, axis=1) / norm(other, axis=1)
+        return found if loss.max() < MAX_ROUNDING else exact
 
     @cached_property
     def _matrices(self) -> TermMatrices:
@@ -136,7 +137,7 @@ class LinearResponse:
         factors = np.append(self.terms.factors(law)[0].numpy(), 1.0)
         inverse, (characters, dofs, _, scales) = self._inverse(factors), self.orbits
         support = (factors @ self._supports.numpy()).reshape(dofs.shape)
-        dtype = self.blocks.values.dtype
+        dtype = self.blocks.dtype
 
         def solve(force: Array) -> tuple[float, Parts, Parts]:
             parts = np.empty(dofs.shape, dtype)
@@ -148,12 +149,12 @@ class LinearResponse:
     def _inverse(self, factors: Array) -> Callable[[Parts], Parts]:
         """Return f -> K(0)^-1 f, (M, m) each, of factors and 1, (T + 1,); f is of order one."""
         if not self.terms.varies:
-            return partial(_solutions, self.blocks)
-        shape, dtype = self.orbits.dofs.shape, self.blocks.values.dtype
+            return partial(condensed_solutions, self.blocks)
+        shape, dtype = self.orbits.dofs.shape, self.blocks.dtype
         matrix, ends = self._matrices.at(factors), (self.terms.rtol, 2 * self.terms.bound)
 
         def precondition(residual: Array) -> Array:
-            return _solutions(self.blocks, residual.reshape(shape)).astype(np.float64).ravel()
+            return condensed_solutions(self.blocks, residual.reshape(shape)).astype(np.float64).ravel()
 
         def solve(parts: Parts) -> Parts:
             right = parts.astype(np.float64).ravel()
@@ -216,7 +217,7 @@ class LinearResponse:
         if right.device.type != "cpu" or many:
             return self.by_tensors(right, factors)
         size, shape = largest(right), self.orbits.dofs.shape
-        parts = (right / size).numpy().reshape(-1, *shape).astype(self.blocks.values.dtype)
+        parts = (right / size).numpy().reshape(-1, *shape).astype(self.blocks.dtype)
         rows = list(zip(parts, factors.numpy(), strict=True))
         found = on_threads(lambda row: self._inverse(row[1])(row[0]), rows)
         return size * torch.from_numpy(np.stack(found)).flatten(1) if found else right.clone()
@@ -314,10 +315,3 @@ def largest(right: Tensor) -> Tensor:
     size = right.abs().amax(dim=1, keepdim=True)
     return torch.where(size > 0, size, 1.0)
 
-
-def _solutions(blocks: Condensed, forces: Parts) -> Parts:
-    """Return the solutions of forces, (M, m) each, in the type of the blocks."""
-    table, unknowns, _, values = blocks
-    solutions = np.empty(forces.shape, values.dtype)
-    condensed_solves(table, unknowns, values, forces.astype(values.dtype), solutions)
-    return solutions

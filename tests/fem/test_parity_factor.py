@@ -39,7 +39,7 @@ def test_the_factor_by_parity_solves_like_the_whole_with_one_unknown_for_each_or
     right *= np.array([[1.0], [1e-60], [1e60], [0.0]])
     factor, exact = solver.float32_factor, solver.factor.solve_many(right)
     assert isinstance(factor, ParityFactor)
-    assert (norm(factor.solve_many(right) - exact, axis=1) <= 1e-5 * norm(exact, axis=1)).all()
+    assert (norm(factor.solve_many(right) - exact, axis=1) <= 5e-5 * norm(exact, axis=1)).all()
     assert len(factor.blocks.values) == count
     assert factor.orbits.dofs.shape[1] < 0.75 * solver.problem.pattern.size
 

@@ -103,7 +103,7 @@ def test_the_linear_solution_of_every_force_is_exact_for_all_parameters(scene, g
     force, own = forces(scene), parameters(scene)
     found = response(at_free(scene, force), own)
     error = relative(found, at_free(scene, exact(scene, force, own)))
-    assert error < (1e-4 if own.shape[1] else 1e-5)
+    assert error < (1e-4 if own.shape[1] else 5e-5)
 
 
 def test_the_stiffness_has_the_expected_number_of_terms():
@@ -140,9 +140,9 @@ def test_a_batch_is_solved_like_its_members(name, monkeypatch):
     assert relative(response(loaded, own), whole) < 1e-6
 
 
-def test_blocks_are_float64_where_float32_is_not_accurate_enough(monkeypatch):
+def test_blocks_are_float64_where_rounded_ones_are_not_accurate_enough(monkeypatch):
     scene = scene_of(PLAIN)
-    assert LinearResponse(scene, []).blocks.values.dtype == "float32"
+    assert LinearResponse(scene, []).blocks.values.dtype == "int16"
     monkeypatch.setattr(linear_response, "MAX_ROUNDING", 0.0)
     response = LinearResponse(scene, [])
     force, none = forces(scene), parameters(scene)
@@ -204,7 +204,7 @@ def test_images_of_a_load_have_the_images_of_its_solution():
     field[:, scene.problem.free] = response(at_free(scene, force), none)
     for symmetry in group:
         image = response(at_free(scene, symmetry.image(force)), none)
-        assert relative(image, at_free(scene, symmetry.image(field))) < 1e-5
+        assert relative(image, at_free(scene, symmetry.image(field))) < 5e-5
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,8 @@ boundary,
     backward, parents first:  u_I = g - X u_J
 
 The blocks are stored as they are multiplied, so that a solution consists of products of dense
-matrices and vectors. A front without forces below it is left out of the forward pass.
+matrices and vectors (`condensed_solves`). `rounded` blocks have 16 bits for each entry: a solution
+reads the blocks once or twice and takes as long as that.
 
 Sources: George (1973), Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10;
 Duff, Reid (1983), The multifrontal solution of indefinite sparse symmetric linear equations, ACM
@@ -21,12 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import float32, float64, int64, njit, void
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
+from dpl.fem.linear.condensed_loops import condensed_solves, round_rows, wide
 from dpl.fem.linear.interface import SingularMatrix
 
 Integers = NDArray[np.int64]
@@ -34,6 +35,9 @@ Integers = NDArray[np.int64]
 LEAF = 64  # unknowns of a part that is not divided further
 SMALLEST_SIDE = 0.05  # of the unknowns of a part
 SAME = 1e-9  # difference of coordinates, over the size of the body, of one layer
+TESTS = 8  # vectors whose products `rounded` blocks preserve
+SWEEPS = 3  # of the scaling of rows and columns before their entries are rounded
+LARGEST = 2**15 - 2  # entry in units of its row and column; rounding up adds one
 
 
 def _dissect(
@@ -90,13 +94,33 @@ class Condensed(NamedTuple):
     """Blocks of P matrices with the same fronts, children before their parents.
 
     A row of the table has the first and last position of the pivots among the unknowns, the last
-    position of the boundary, and the position of the blocks among the values.
+    position of the boundary, and the position of the blocks among the values. Rows of blocks are
+    filled with zeros to a length that loops like, see `wide`. The entries are values times factors
+    of their row and column.
     """
 
     table: Integers  # (S, 4)
     unknowns: Integers  # pivots and boundary of one front after the other, (T,)
     heights: Integers  # 0 without children, else one more than the largest of theirs, (S,)
-    values: NDArray[Any]  # F_II^-1 and X of one front after the other, row by row, (P, V)
+    values: NDArray[Any]  # F_II^-T and X of one front after the other, row by row, (P, V)
+    factors: NDArray[Any]  # of rows of F_II^-T, rows of X, and columns, by unknowns, (P, 3, T)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of forces and solutions: float32 for rounded values, else float64."""
+        return self.factors.dtype
+
+    def front(self, p: int, k: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return F_II^-1 (I, I) and X (I, J) of a front of a matrix in `dtype`."""
+        first, middle, last, place = self.table[k].tolist()
+        of_inverse, of_coupling, columns = self.factors[p, :, first:last]
+        count, found = middle - first, []
+        for rows, own in ((of_inverse, columns[:count]), (of_coupling, columns[count:])):
+            width = wide(len(own))
+            block = self.values[p, place : place + count * width].reshape(count, width)
+            found.append(rows[:count, None] * block[:, : len(own)] * own)
+            place += count * width
+        return found[0].T, found[1]
 
 
 def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Condensed:
@@ -142,106 +166,85 @@ def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Cond
         X = inverse @ F[:, :count, count:]
         updates[k] = boundary, F[:, count:, count:] - F[:, count:, :count] @ X
         table.append((first, first + count, first + len(both), place))
-        first, place = first + len(both), place + count * len(both)
         unknowns.append(both)
-        blocks += [inverse.reshape(len(F), -1), X.reshape(len(F), -1)]
+        for block in (inverse, X):
+            filled = np.zeros((len(F), count, wide(block.shape[2])))
+            filled[..., : block.shape[2]] = block
+            blocks.append(filled.reshape(len(F), -1))
+            place += blocks[-1].shape[1]
+        first += len(both)
+    factors = np.ones((len(matrices), 3, first))
     arrays = np.array(table), np.concatenate(unknowns), heights
-    return Condensed(*arrays, np.concatenate(blocks, axis=1))
+    return Condensed(*arrays, np.concatenate(blocks, axis=1), factors)
 
 
-@njit(fastmath=True)
-def add_product(x, A, y):  # type: ignore[no-untyped-def]
-    """Add x A to y, (R,), for x (F,) and A (F, R); four rows where x is zero are not read."""
-    n = A.shape[1]
-    i = 0
-    while i + 4 <= len(x):
-        a, b, c, d = x[i], x[i + 1], x[i + 2], x[i + 3]
-        if a != 0.0 or b != 0.0 or c != 0.0 or d != 0.0:
-            for j in range(n):
-                y[j] += a * A[i, j] + b * A[i + 1, j] + c * A[i + 2, j] + d * A[i + 3, j]
-        i += 4
-    while i < len(x):
-        for j in range(n):
-            y[j] += x[i] * A[i, j]
-        i += 1
+def rounded(blocks: Condensed, forces: NDArray[np.float64] | None = None) -> Condensed:
+    """Return blocks of 16-bit integers with factors in float32.
 
+    Each entry is rounded up or down such that the products of its row with the vectors of some
+    solutions stay the same, those of `TESTS` random forces and of given ones, (K, P, n). Solutions
+    of smooth forces then change by 1e-6, of others by 1e-5; with the nearest numbers both change by
+    1e-5 to 3e-5.
 
-@njit(fastmath=True)
-def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
-    """Subtract A x from y, (F,), for A (F, R) and x (R,); x is read once for four rows."""
-    n = A.shape[1]
-    i = 0
-    while i + 4 <= len(y):
-        a = b = c = d = x.dtype.type(0)
-        for j in range(n):
-            a += A[i, j] * x[j]
-            b += A[i + 1, j] * x[j]
-            c += A[i + 2, j] * x[j]
-            d += A[i + 3, j] * x[j]
-        y[i] -= a
-        y[i + 1] -= b
-        y[i + 2] -= c
-        y[i + 3] -= d
-        i += 4
-    while i < len(y):
-        a = x.dtype.type(0)
-        for j in range(n):
-            a += A[i, j] * x[j]
-        y[i] -= a
-        i += 1
-
-
-@njit
-def take(x, places):  # type: ignore[no-untyped-def]
-    """Return x[places], which numba computes more slowly with checks of the places."""
-    found = np.empty(len(places), x.dtype)
-    for i in range(len(places)):
-        found[i] = x[places[i]]
-    return found
-
-
-@njit(
-    [
-        void(int64[:, ::1], int64[::1], float32[:, ::1], float32[:, ::1], float32[:, ::1]),
-        void(int64[:, ::1], int64[::1], float32[:, ::1], float64[:, ::1], float64[:, ::1]),
-        void(int64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1]),
-    ],
-    nogil=True,
-    cache=True,
-)
-def condensed_solves(table, unknowns, values, forces, solutions):  # type: ignore[no-untyped-def]
-    """Set `solutions` (P, n) to those of P matrices, one force (P, n) each, of the same type.
-
-    The forces are in float64 or in the type of the blocks and are overwritten. See `Condensed` for
-    table, unknowns and values, (P, V).
+    Source: Frantar, Ashkboos, Hoefler, Alistarh (2023), GPTQ, ICLR (rounding that makes up for the
+    errors of the entries before).
     """
+    values = np.zeros(blocks.values.shape, np.int16)
+    factors, size = np.ones(blocks.factors.shape, np.float32), len(np.unique(blocks.unknowns))
     for p in range(len(values)):
-        force, solution = forces[p], solutions[p]
-        if not force.any():
-            solution[:] = 0.0
-            continue
-        for s in range(len(table)):
-            first, middle, last, place = table[s]
-            pivots, boundary = unknowns[first:middle], unknowns[middle:last]
-            own, count = take(force, pivots), len(pivots)
-            inner, start = np.zeros_like(own), place + count * count
-            if own.any():
-                add_product(own, values[p, place:start].reshape((count, count)), inner)
-                passed = np.zeros(len(boundary), own.dtype)
-                X = values[p, start : start + count * len(boundary)]
-                add_product(own, X.reshape((count, len(boundary))), passed)
-                for j in range(len(boundary)):
-                    force[boundary[j]] -= passed[j]
-            for i in range(count):
-                solution[pivots[i]] = inner[i]
-        for s in range(len(table) - 1, -1, -1):
-            first, middle, last, place = table[s]
-            pivots, boundary = unknowns[first:middle], unknowns[middle:last]
-            own, count = take(solution, pivots), len(pivots)
-            X = values[p, place + count * count : place + count * (count + len(boundary))]
-            subtract_product(X.reshape((count, len(boundary))), take(solution, boundary), own)
-            for i in range(count):
-                solution[pivots[i]] = own[i]
+        right = np.random.default_rng(1).standard_normal((size, TESTS))
+        if forces is not None:
+            right = np.concatenate([right, forces[:, p].T], axis=1)
+        solutions, acting = np.zeros_like(right), []
+        for k, (first, middle, last, _) in enumerate(blocks.table.tolist()):
+            pivots, boundary = blocks.unknowns[first:middle], blocks.unknowns[middle:last]
+            inverse, X = blocks.front(p, k)
+            acting.append(right[pivots])
+            solutions[pivots] = inverse @ right[pivots]
+            right[boundary] -= X.T @ right[pivots]
+        for k, (first, middle, last, place) in reversed(list(enumerate(blocks.table.tolist()))):
+            pivots, boundary = blocks.unknowns[first:middle], blocks.unknowns[middle:last]
+            inverse, X = blocks.front(p, k)
+            solutions[pivots] -= X @ solutions[boundary]
+            tests, count = (acting[k], solutions[boundary]), middle - first
+            for n, (block, own) in enumerate(zip((inverse, X), tests, strict=True)):
+                rows, columns = _scales(block)
+                scaled, own = block / (rows[:, None] * columns), columns[:, None] * own
+                own /= np.maximum(np.linalg.norm(own, axis=0), np.finfo(float).tiny)
+                found = np.empty(block.shape, np.int16)
+                round_rows(scaled, own, np.argsort(-np.linalg.norm(own, axis=1)), found)
+                if n == 0:
+                    found, rows, columns = found.T, columns, rows
+                factors[p, n, first:middle] = rows
+                factors[p, 2, slice(middle, last) if n else slice(first, middle)] = columns
+                end = place + count * wide(len(columns))
+                values[p, place:end].reshape(count, -1)[:, : len(columns)] = found
+                place = end
+    return blocks._replace(values=values, factors=factors)
+
+
+def _scales(block: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return factors of rows and columns over which entries are at most `LARGEST`, and similar.
+
+    Source: Ruiz (2001), A scaling algorithm to equilibrate both rows and columns norms in matrices.
+    """
+    size = np.abs(block)
+    rows, columns = np.ones(len(block)), np.ones(block.shape[1])
+    for _ in range(SWEEPS):
+        for axis, factors in ((1, rows), (0, columns)):
+            most = np.sqrt((size / (rows[:, None] * columns)).max(axis=axis, initial=0.0))
+            factors *= np.where(most > 0, most, 1.0)
+    most = (size / (rows[:, None] * columns)).max(axis=1, initial=0.0)
+    rows = np.where(most > 0, rows * most, 1.0) / LARGEST
+    return rows.astype(np.float32).astype(float), columns.astype(np.float32).astype(float)
+
+
+def condensed_solutions(blocks: Condensed, forces: NDArray[Any]) -> NDArray[Any]:
+    """Return the solutions of one force for each of P matrices, (P, n) each, in their dtype."""
+    solutions = np.empty(forces.shape, blocks.dtype)
+    table, unknowns, _, values, factors = blocks
+    condensed_solves(table, unknowns, values, factors, forces.astype(blocks.dtype), solutions)
+    return solutions
 
 
 def add_inverses(
@@ -253,18 +256,17 @@ def add_inverses(
     that only the forward pass is made, for all columns at once and in the dtype of the blocks.
     """
     size = len(np.unique(blocks.unknowns))
-    for values, own in zip(blocks.values, signs, strict=True):
-        forces = np.zeros((size, len(unknowns)), values.dtype)
+    for p, own in enumerate(signs):
+        forces = np.zeros((size, len(unknowns)), blocks.dtype)
         forces[unknowns, np.arange(len(unknowns))] = own
-        for first, middle, last, place in blocks.table.tolist():
+        for k, (first, middle, last, _) in enumerate(blocks.table.tolist()):
             pivots, boundary = blocks.unknowns[first:middle], blocks.unknowns[middle:last]
             acting = np.flatnonzero(forces[pivots].any(axis=0))
             if not len(acting):
                 continue
-            count, right = len(pivots), forces[pivots[:, None], acting]
-            inverse, X = np.split(values[place : place + count * (last - first)], [count * count])
-            out[acting[:, None], acting] += right.T @ (inverse.reshape(count, count) @ right)
-            forces[boundary[:, None], acting] -= X.reshape(count, len(boundary)).T @ right
+            right, (inverse, X) = forces[pivots[:, None], acting], blocks.front(p, k)
+            out[acting[:, None], acting] += right.T @ (inverse @ right)
+            forces[boundary[:, None], acting] -= X.T @ right
             yield
 
 
@@ -287,7 +289,7 @@ class Layers(NamedTuple):
 
 def condensed_layers(blocks: Condensed, device: torch.device | str) -> Layers:
     """Return the blocks on a device, in their dtype."""
-    table, unknowns, heights, values = blocks
+    table, unknowns, heights, values, _ = blocks
     run = run_length(unknowns, table[:, 1], table[:, 2])
     size, widths = len(np.unique(unknowns)), np.diff(table[:, :3])  # numbers of pivots, boundary
     kinds = np.stack([heights, np.rint(np.log2(widths[:, 0])).astype(int)], axis=1)
@@ -296,15 +298,13 @@ def condensed_layers(blocks: Condensed, device: torch.device | str) -> Layers:
         chosen = np.flatnonzero((kinds == kind).all(axis=1))
         count, others = widths[chosen].max(axis=0)
         pivots, boundary = (np.full((len(chosen), width), size) for width in (count, others))
-        inverse = np.zeros((len(values), len(chosen), count, count), values.dtype)
-        coupling = np.zeros((len(values), len(chosen), count, others), values.dtype)
-        for k, (first, middle, last, place) in enumerate(table[chosen].tolist()):
+        inverse = np.zeros((len(values), len(chosen), count, count), blocks.dtype)
+        coupling = np.zeros((len(values), len(chosen), count, others), blocks.dtype)
+        for k, (first, middle, last, _) in enumerate(table[chosen].tolist()):
             own, other = middle - first, last - middle
             pivots[k, :own], boundary[k, :other] = unknowns[first:middle], unknowns[middle:last]
-            block = values[:, place : place + own * (own + other)]
-            square, rest = np.split(block, [own * own], axis=1)
-            inverse[:, k, :own, :own] = square.reshape(len(values), own, own)
-            coupling[:, k, :own, :other] = rest.reshape(len(values), own, other)
+            for p in range(len(values)):
+                inverse[p, k, :own, :own], coupling[p, k, :own, :other] = blocks.front(p, chosen[k])
         runs = (part.ravel()[::run] // run for part in (pivots, boundary))
         layers.append((*runs, inverse, coupling))
     none, size = np.array([size // run]), size // run

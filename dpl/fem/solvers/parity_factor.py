@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from scipy.sparse import block_diag, coo_array, csr_array, dia_array
 from torch import Tensor
 
-from dpl.fem.linear.condensation import Condensed, add_inverses, condense, condensed_solves
+from dpl.fem.linear.condensation import (
+    Condensed,
+    add_inverses,
+    condense,
+    condensed_solutions,
+    rounded,
+)
 from dpl.fem.linear.interface import Array, Factor, full_matrix
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
@@ -117,7 +123,7 @@ class OrbitForm(NamedTuple):
 class ParityFactor(Factor):
     """Nested condensation of K(0) for one value of each of m orbits, M parities."""
 
-    blocks: Condensed  # blocks of the parities in float32
+    blocks: Condensed  # rounded blocks of the parities
     orbits: OrbitArrays  # free degrees of freedom of each orbit
     negative_pivots: int = 0
 
@@ -125,17 +131,15 @@ class ParityFactor(Factor):
     def of(cls, problem: Problem, group: SymmetryGroup) -> Self:
         """Factorise K(0) of a body; raise a `SingularMatrix` if it is not positive definite."""
         form = OrbitForm.of(problem, group)
-        exact = condense(form.matrices(problem), form.points)
-        blocks = exact._replace(values=exact.values.astype(np.float32))
+        blocks = rounded(condense(form.matrices(problem), form.points))
         return cls(blocks, form.arrays(np.arange(problem.pattern.size)))
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
-        """Return x, (n,), with K x = right, in the accuracy of float32."""
+        """Return x, (n,), with K x = right, in the accuracy of the rounded blocks."""
         characters, dofs, signs, scales = self.orbits
-        (parts, solved), x = np.empty((2, *dofs.shape), np.float32), np.empty_like(right)
+        parts, x = np.empty(dofs.shape, np.float32), np.empty_like(right)
         unit = split_field(characters, dofs, scales, right, np.zeros(dofs.shape), parts)
-        table, unknowns, _, values = self.blocks
-        condensed_solves(table, unknowns, values, parts, solved)
+        solved = condensed_solutions(self.blocks, parts)
         join_field(characters, dofs, signs, solved, unit, x)
         return x
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.lanes import gather_constants, rows
 from dpl.fem.assembly.simd import SIMD_WIDTH
-from dpl.fem.linear import condensation
-from dpl.fem.linear.condensation import add_product, subtract_product
+from dpl.fem.linear import condensed_loops
+from dpl.fem.linear.condensed_loops import add_product, subtract_product
 from dpl.fem.solvers import parity_factor
 from dpl.fem.solvers.parity_factor import OrbitArrays, join_field
 from dpl.models.unrolled import feature_loops
@@ -26,7 +26,7 @@ from dpl.models.unrolled.feature_loops import rotated_strain, unbalanced_stress
 SOURCES = (
     element_loops.SOURCES
     + feature_loops.SOURCES
-    + "".join(inspect.getsource(m) for m in (condensation, parity_factor, sys.modules[__name__]))
+    + "".join(inspect.getsource(m) for m in (condensed_loops, parity_factor, sys.modules[__name__]))
 )
 
 

@@ -254,7 +254,7 @@ class Unrolled(StoredBuffers):
             return torch.from_numpy(array).to(device)
 
         orbits = OrbitArrays(*map(on_device, arrays.orbits))
-        modes = on_device(arrays.modes.astype(self.linear.blocks.values.dtype))
+        modes = on_device(arrays.modes.astype(self.linear.blocks.dtype))
         model = in_rows(ModelArrays(orbits, *map(on_device, arrays[1:])))._replace(modes=modes)
         law = self.terms.problem.material.of_cells(self.cells.cpu()[cells]).centred()
         places = on_device(arrays.columns.ravel().argsort()[: self.modes.shape[1]])
