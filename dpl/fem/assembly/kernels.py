@@ -211,17 +211,18 @@ def call_compiled(kernel: Any, law: Law, *arguments: Any) -> Any:
     """
     given = tuple(argument is not None for argument in arguments)  # numba compiles for each
     variant = (kernel, law.kind.name, given)
+    if variant in _LOADED:
+        return kernel(law, *arguments)
     with contextlib.ExitStack() as stack:
         # no lock on other systems, or in a read-only folder, where numba does not save
         with contextlib.suppress(ImportError, OSError):
-            if variant not in _LOADED:
-                import fcntl
+            import fcntl
 
-                folder = Path(kernel.stats.cache_path)
-                folder.mkdir(parents=True, exist_ok=True)
-                lock = stack.enter_context((folder / "kernels.lock").open("w"))
-                fcntl.flock(lock, fcntl.LOCK_EX)
-        if variant not in _LOADED and parent_process() is None:
+            folder = Path(kernel.stats.cache_path)
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context((folder / "kernels.lock").open("w"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        if parent_process() is None:
             timer = threading.Timer(PATIENCE, _announce)
             timer.daemon = True
             timer.start()

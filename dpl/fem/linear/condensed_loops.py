@@ -3,7 +3,7 @@
 import numpy as np
 from numba import float32, float64, int16, int64, njit, void
 
-LANES = 32  # entries of a row that a loop multiplies at once
+LANES = 16  # entries of a row that a loop multiplies at once
 
 
 @njit

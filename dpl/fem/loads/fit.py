@@ -1,11 +1,11 @@
 """Least-squares fit of a force by a few fixed forces, by which families recognise their loads."""
 
-import math
 from collections.abc import Callable
 
 import numpy as np
 from numba import float64, njit
 from numba.types import Array as Typed
+from numba.types import Tuple
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -16,31 +16,66 @@ EDGE = 1e-6  # of the largest size: a size that much below its range lies in it,
 FITS = 1e-6  # distance from a family up to which a force belongs to it [-]
 
 
-@njit([float64(SHAPES, FORCE, float64, float64[::1], float64[:, ::1], float64[::1])], cache=True)
-def _add_normal_equations(shapes, force, unit, q, matrix, right):  # type: ignore[no-untyped-def]
-    """Add the products of shapes (N, D, K) to `matrix`, unless empty, and with the rest to `right`.
+@njit(fastmath={"reassoc", "contract"})
+def _dot(x, y):  # type: ignore[no-untyped-def]
+    """Return x . y."""
+    total = 0.0
+    for i in range(len(x)):
+        total += x[i] * y[i]
+    return total
 
-    The rest is a force (N, D) over a unit minus the sum of q (K,) times shapes, at the nodes on
-    which the force acts. Returns the square of its norm.
+
+@njit([Tuple((float64[:, ::1], float64[:, ::1], float64))(SHAPES, FORCE)], cache=True)
+def _loaded(shapes, force):  # type: ignore[no-untyped-def]
+    """Return shapes (N, D, K) and a force (N, D) at the nodes on which the force acts, (K + 1, n).
+
+    The force is the last row, over its largest entry. All products of the rows, (K + 1, K + 1), and
+    this entry follow.
     """
-    square = 0.0
+    count, largest = 0, 0.0
+    nodes = np.empty(len(force), np.int64)
     for n in range(len(force)):
-        is_loaded = False
+        most = 0.0
         for i in range(force.shape[1]):
-            is_loaded = is_loaded or force[n, i] != 0
-        if not is_loaded:
-            continue
-        for i in range(force.shape[1]):
-            rest = force[n, i] / unit
-            for k in range(len(q)):
-                rest -= q[k] * shapes[n, i, k]
-            square += rest * rest
-            for k in range(len(q)):
-                right[k] += rest * shapes[n, i, k]
-            for k in range(len(matrix)):
-                for m in range(k + 1):
-                    matrix[k, m] += shapes[n, i, k] * shapes[n, i, m]
-    return square
+            most = max(most, abs(force[n, i]))
+        if most > 0:
+            nodes[count] = n
+            count += 1
+        largest = max(largest, most)
+    K, dim = shapes.shape[2], force.shape[1]
+    rows, products = np.empty((K + 1, count * dim)), np.empty((K + 1, K + 1))
+    for j in range(count):
+        for i in range(dim):
+            for k in range(K):
+                rows[k, j * dim + i] = shapes[nodes[j], i, k]
+            rows[K, j * dim + i] = force[nodes[j], i] / largest
+    for k in range(K + 1):
+        for m in range(k + 1):
+            products[k, m] = products[m, k] = _dot(rows[k], rows[m])
+    return rows, products, largest
+
+
+@njit([Tuple((float64[::1], float64))(float64[:, ::1], *[float64[:, :]] * 2, float64[:])], cache=True)
+def _fitted(rows, products, axes, inverse):  # type: ignore[no-untyped-def]
+    """Return coefficients (K,) and the relative residual of the fit of rows of `_loaded`.
+
+    The normal equations are solved by eigenvectors and inverse eigenvalues, (K, K) and (K,).
+    """
+    K, size = len(axes), np.sqrt(products[-1, -1])
+    q, right, rest = np.zeros(K), products[:-1, -1].copy(), rows[-1].copy()
+    for _ in range(2):  # the second time removes the rounding error of the normal equations
+        for j in range(K):
+            along = 0.0
+            for k in range(K):
+                along += axes[k, j] * right[k]
+            for k in range(K):
+                q[k] += inverse[j] * along * axes[k, j]
+        rest[:] = rows[-1]
+        for k in range(K):
+            rest -= q[k] * rows[k]
+        for k in range(K):
+            right[k] = _dot(rows[k], rest)
+    return q, np.sqrt(_dot(rest, rest)) / size
 
 
 def fit(
@@ -52,17 +87,13 @@ def fit(
     are linearly dependent, the coefficients with the smallest norm are returned, or coefficients in
     [low, high] of the same fit if those are not. A zero force has the residual 0.
     """
-    unit, count = float(np.abs(force).max(initial=0.0)), shapes.shape[-1]
+    rows, products, unit = _loaded(shapes, force)
     if unit == 0:
-        return np.zeros(count), 0.0
-    q, (matrix, right) = np.zeros(count), (np.zeros((count, count)), np.zeros(count))
-    whole = _add_normal_equations(shapes, force, unit, q, matrix, right)
-    sizes, axes = np.linalg.eigh(matrix)  # which reads the lower triangle
+        return np.zeros(shapes.shape[-1]), 0.0
+    sizes, axes = np.linalg.eigh(products[:-1, :-1])
     inverse = np.where(sizes > LEAST_SQUARE * sizes[-1], 1 / np.maximum(sizes, 1e-300), 0.0)
-    for _ in range(2):  # the second time removes the rounding error of the normal equations
-        q, right = q + axes @ (inverse * (right @ axes)), np.zeros(count)
-        square = _add_normal_equations(shapes, force, unit, q, matrix[:0], right)
-    q, residual = unit * q, math.sqrt(square / whole)
+    q, residual = _fitted(rows, products, axes, inverse)
+    q *= unit
     if inverse.all() or low <= q.min() <= q.max() <= high:
         return q, residual
     from scipy.optimize import lsq_linear  # its import is not needed for independent shapes

@@ -24,6 +24,7 @@ from dpl.fem.linear.condensation import (
     condensed_solutions,
     rounded,
 )
+from dpl.fem.linear.condensed_loops import add_product
 from dpl.fem.linear.interface import Array, Factor, full_matrix
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
@@ -49,17 +50,22 @@ class OrbitArrays(NamedTuple):
 def split_field(characters, dofs, scales, field, support, parts):  # type: ignore[no-untyped-def]
     """Set parts (M, m) by parity of a field (n,) minus `support` (M, m), over a unit; return it.
 
-    The unit is the largest entry, so that parts in float32 neither underflow nor overflow.
+    The unit is of the size of the largest entry, so that parts in float32 neither underflow
+    nor overflow.
     """
-    whole, own = -support, np.empty(dofs.shape[1])
+    own, whole = np.empty(dofs.shape), np.empty(dofs.shape[1])
+    largest = 0.0
     for g in range(len(dofs)):
-        for j in range(len(own)):
-            own[j] = scales[g, j] * field[dofs[g, j]]
-        for p in range(len(dofs)):
-            whole[p] += characters[p, g] * own
-    largest = np.abs(whole).max()
+        for j in range(dofs.shape[1]):
+            own[g, j] = scales[g, j] * field[dofs[g, j]]
+            size = abs(own[g, j]) + abs(support[g, j])
+            if size > largest:
+                largest = size
     unit = largest if largest > 0 else 1.0
-    parts[:] = whole / unit
+    for p in range(len(dofs)):
+        whole[:] = -support[p]
+        add_product(characters[p], own, whole)
+        parts[p] = whole / unit
     return unit
 
 
@@ -69,9 +75,8 @@ def join_field(characters, dofs, signs, parts, unit, field):  # type: ignore[no-
     own = np.empty(dofs.shape[1])
     for g in range(len(dofs)):
         own[:] = 0.0
-        for p in range(len(dofs)):
-            own += (unit * characters[p, g]) * parts[p]
-        for j in range(len(own)):
+        add_product(unit * characters[:, g], parts, own)
+        for j in range(dofs.shape[1]):
             field[dofs[g, j]] = signs[g, j] * own[j]
 
 

@@ -76,22 +76,19 @@ class ModelArrays(NamedTuple):
 @njit(fastmath=True)
 def split(characters, signs, images, out):
     """Set `out` (M, b) to the parts of each parity of values (M, b) at all images."""
+    signed = signs * images
     out[:] = 0.0
     for p in range(len(characters)):
-        for g in range(len(characters)):
-            factor = characters[p, g]
-            for j in range(out.shape[1]):
-                out[p, j] += factor * signs[g, j] * images[g, j]
+        add_product(characters[p], signed, out[p])
 
 
 @njit(fastmath=True)
 def join(characters, signs, parts, out):
     """Add the values at all images of parts (M, b) of each parity to `out` (M, b)."""
+    values = np.zeros_like(parts)
     for g in range(len(characters)):
-        for p in range(len(characters)):
-            factor = characters[p, g]
-            for j in range(out.shape[1]):
-                out[g, j] += factor * signs[g, j] * parts[p, j]
+        add_product(characters[:, g], parts, values[g])
+    out += signs * values
 
 
 @njit
