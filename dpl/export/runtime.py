@@ -126,7 +126,10 @@ def _model(net: Unrolled) -> Arrays:
     table, unknowns, *_ = linear.blocks
     count, fronts = len(linear.blocks.values), range(len(table))
     blocks = [
-        [np.hstack([a.T.ravel(), b.ravel()]) for a, b in (linear.blocks.front(p, k) for k in fronts)]
+        [
+            np.hstack([a.T.ravel(), b.ravel()])
+            for a, b in (linear.blocks.front(p, k) for k in fronts)
+        ]
         for p in range(count)
     ]
     sizes = [len(block) for block in blocks[0]]

@@ -154,7 +154,9 @@ class LinearResponse:
         matrix, ends = self._matrices.at(factors), (self.terms.rtol, 2 * self.terms.bound)
 
         def precondition(residual: Array) -> Array:
-            return condensed_solutions(self.blocks, residual.reshape(shape)).astype(np.float64).ravel()
+            return (
+                condensed_solutions(self.blocks, residual.reshape(shape)).astype(np.float64).ravel()
+            )
 
         def solve(parts: Parts) -> Parts:
             right = parts.astype(np.float64).ravel()
@@ -314,4 +316,3 @@ def largest(right: Tensor) -> Tensor:
     """Return the largest entries (B, 1) of rows, over which float32 holds them; 1 of zeros."""
     size = right.abs().amax(dim=1, keepdim=True)
     return torch.where(size > 0, size, 1.0)
-

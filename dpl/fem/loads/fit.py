@@ -55,7 +55,9 @@ def _loaded(shapes, force):  # type: ignore[no-untyped-def]
     return rows, products, largest
 
 
-@njit([Tuple((float64[::1], float64))(float64[:, ::1], *[float64[:, :]] * 2, float64[:])], cache=True)
+@njit(
+    [Tuple((float64[::1], float64))(float64[:, ::1], *[float64[:, :]] * 2, float64[:])], cache=True
+)
 def _fitted(rows, products, axes, inverse):  # type: ignore[no-untyped-def]
     """Return coefficients (K,) and the relative residual of the fit of rows of `_loaded`.
 
