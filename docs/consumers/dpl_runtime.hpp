@@ -50,6 +50,7 @@ struct Patch {
 };
 
 namespace detail {
+using Doubles = std::vector<double>;
 
 // ---------------------------------------------------------------- SIMD: W lanes of a block of L
 constexpr int L = 8;
@@ -63,15 +64,21 @@ constexpr int W = 2;
 #endif
 typedef double V __attribute__((vector_size(8 * W)));
 typedef float F __attribute__((vector_size(4 * W)));
+typedef float Floats __attribute__((vector_size(8 * W)));
+typedef std::int16_t Shorts __attribute__((vector_size(4 * W)));
 typedef std::int64_t I __attribute__((vector_size(8 * W)));
 #define DPL_INLINE inline __attribute__((always_inline))
 DPL_INLINE V widen(F x) { return __builtin_convertvector(x, V); }
+DPL_INLINE Floats widen(Shorts x) { return __builtin_convertvector(x, Floats); }
 #else
 constexpr int W = 1;
 using V = double;
 using F = float;
+using Floats = float;
+using Shorts = std::int16_t;
 #define DPL_INLINE inline
 DPL_INLINE V widen(F x) { return x; }
+DPL_INLINE Floats widen(Shorts x) { return x; }
 #endif
 
 template <class To, class From> DPL_INLINE To bits(const From& from) {
@@ -80,22 +87,25 @@ template <class To, class From> DPL_INLINE To bits(const From& from) {
   std::memcpy(&to, &from, sizeof to);
   return to;
 }
-DPL_INLINE V load(const double* p) {
-  V v;
+template <class Vector, class T> DPL_INLINE Vector read(const T* p) {
+  Vector v;
   std::memcpy(&v, p, sizeof v);
   return v;
 }
-DPL_INLINE V load(const float* p) {
-  F v;
-  std::memcpy(&v, p, sizeof v);
-  return widen(v);
-}
-DPL_INLINE void store(double* p, V v) { std::memcpy(p, &v, sizeof v); }
+DPL_INLINE V load(const double* p) { return read<V>(p); }
+template <class T, class Vector> DPL_INLINE void store(T* p, Vector v) { std::memcpy(p, &v, sizeof v); }
 DPL_INLINE V all(double x) { return V{} + x; }
-DPL_INLINE double sum(V v) {
-  double lanes[W], total = 0;
+// Vectors of the type T of sums, of numbers of this type or of half its size.
+template <class T> using Sums = typename std::conditional<std::is_same<T, float>::value, Floats, V>::type;
+template <class T> using Half = typename std::conditional<std::is_same<T, float>::value, Shorts, F>::type;
+template <class T, class Number> DPL_INLINE Sums<T> load_as(const Number* p) {
+  if constexpr (std::is_same<T, Number>::value) return read<Sums<T>>(p);
+  else return widen(read<Half<T>>(p));
+}
+template <class T> DPL_INLINE T sum(Sums<T> v) {
+  T lanes[sizeof v / sizeof(T)], total = 0;
   store(lanes, v);
-  for (double x : lanes) total += x;
+  for (T x : lanes) total += x;
   return total;
 }
 
@@ -137,53 +147,58 @@ template <class T> DPL_INLINE void prefetch(const T* rows, int j) {
   (void)rows, (void)j;
 #endif
 }
-template <class T>
-inline void add_product(const double* x, const T* A, int rows, int n, double* y) {  // y += x A
+template <class T, class Number>
+inline void add_product(const T* x, const Number* A, int rows, int n, T* y) {  // y += x A
+  constexpr int lanes = sizeof(Sums<T>) / sizeof(T);
   int i = 0;
   for (; i + 4 <= rows; i += 4) {
-    const double a = x[i], b = x[i + 1], c = x[i + 2], d = x[i + 3];
+    const T a = x[i], b = x[i + 1], c = x[i + 2], d = x[i + 3];
     if (a == 0 && b == 0 && c == 0 && d == 0) continue;
-    const T *p = A + std::size_t(i) * n, *q = p + n, *r = q + n, *s = r + n;
+    const Number *p = A + std::size_t(i) * n, *q = p + n, *r = q + n, *s = r + n;
     int j = 0;
-    for (; j + W <= n; j += W) {
+    for (; j + lanes <= n; j += lanes) {
       prefetch(p, j);
-      store(y + j, load(y + j) + (a * load(p + j) + b * load(q + j)) + (c * load(r + j) + d * load(s + j)));
+      store(y + j, load_as<T>(y + j) + (a * load_as<T>(p + j) + b * load_as<T>(q + j)) + (c * load_as<T>(r + j) + d * load_as<T>(s + j)));
     }
     for (; j < n; ++j) y[j] += (a * p[j] + b * q[j]) + (c * r[j] + d * s[j]);
   }
   for (; i < rows; ++i)
     for (int j = 0; j < n; ++j) y[j] += x[i] * A[std::size_t(i) * n + j];
 }
-template <class T> inline double dot(const double* x, const T* row, int n) {
-  V total = V{}, other = V{};
+template <class T, class Number> inline T dot(const T* x, const Number* row, int n) {
+  constexpr int lanes = sizeof(Sums<T>) / sizeof(T);
+  Sums<T> total = {}, other = {};
   int j = 0;
-  for (; j + 2 * W <= n; j += 2 * W) {
-    total += load(x + j) * load(row + j);
-    other += load(x + j + W) * load(row + j + W);
+  for (; j + 2 * lanes <= n; j += 2 * lanes) {
+    total += load_as<T>(x + j) * load_as<T>(row + j);
+    other += load_as<T>(x + j + lanes) * load_as<T>(row + j + lanes);
   }
-  double rest = 0;
+  T rest = 0;
   for (; j < n; ++j) rest += x[j] * row[j];
-  return sum(total + other) + rest;
+  return sum<T>(total + other) + rest;
 }
-template <class T>
-inline void subtract_product(const T* A, const double* x, int rows, int n, double* y) {  // y -= A x
+template <class T, class Number>
+inline void subtract_product(const Number* A, const T* x, int rows, int n, T* y) {  // y -= A x
+  constexpr int lanes = sizeof(Sums<T>) / sizeof(T);
   int i = 0;
   for (; i + 4 <= rows; i += 4) {
-    const T *p = A + std::size_t(i) * n, *q = p + n, *r = q + n, *s = r + n;
-    V a = V{}, b = V{}, c = V{}, d = V{};
+    const Number *p = A + std::size_t(i) * n, *q = p + n, *r = q + n, *s = r + n;
+    Sums<T> a = {}, b = {}, c = {}, d = {};
     int j = 0;
-    for (; j + W <= n; j += W) {
-      const V v = load(x + j);
+    for (; j + lanes <= n; j += lanes) {
+      const Sums<T> v = load_as<T>(x + j);
       prefetch(p, j);
-      a += load(p + j) * v, b += load(q + j) * v, c += load(r + j) * v, d += load(s + j) * v;
+      a += load_as<T>(p + j) * v, b += load_as<T>(q + j) * v, c += load_as<T>(r + j) * v, d += load_as<T>(s + j) * v;
     }
-    double rest[4] = {sum(a), sum(b), sum(c), sum(d)};
+    T rest[4] = {sum<T>(a), sum<T>(b), sum<T>(c), sum<T>(d)};
     for (; j < n; ++j) rest[0] += p[j] * x[j], rest[1] += q[j] * x[j], rest[2] += r[j] * x[j], rest[3] += s[j] * x[j];
     for (int k = 0; k < 4; ++k) y[i + k] -= rest[k];
   }
   for (; i < rows; ++i) y[i] -= dot(x, A + std::size_t(i) * n, n);
 }
 inline double norm(const std::vector<double>& x) {
+  const double square = dot(x.data(), x.data(), int(x.size()));
+  if (square > 1e-280 && square < 1e280) return std::sqrt(square);
   double largest = 0;
   for (double v : x) {
     if (v != v) return v;
@@ -261,26 +276,21 @@ template <class Law> DPL_INLINE void piola(const V* c, const V* H, V j, V* P) { 
     e[v] = H[3 * i + k] + H[3 * k + i];
     if (Law::finite) e[v] += H[i] * H[k] + H[3 + i] * H[3 + k] + H[6 + i] * H[6 + k];
   }
-  const V m0 = e[1] * e[2] - e[4] * e[4], m1_ = e[0] * e[2] - e[5] * e[5], m2 = e[0] * e[1] - e[3] * e[3];
-  const V i1 = e[0] + e[1] + e[2], i2 = 2.0 * i1 + (m0 + m1_ + m2);
+  const V minors[6] = {e[1] * e[2] - e[4] * e[4], e[0] * e[2] - e[5] * e[5], e[0] * e[1] - e[3] * e[3],
+                       e[4] * e[5] - e[2] * e[3], e[3] * e[5] - e[0] * e[4], e[3] * e[4] - e[1] * e[5]};
+  const V i1 = e[0] + e[1] + e[2], m = minors[0] + minors[1] + minors[2], i2 = 2.0 * i1 + m;
   if (Law::needs > 1) log_j = log1p(j);
   if (Law::needs > 2) m1 = expm1(-2. / 3 * log_j);
   const Terms t = Law::at(c, i1, i2, j, log_j, m1);
+  // I - C^-1 = (e + beyond I - minors) / det C with det C = 1 + i1 + beyond, without differences of large numbers
+  const V beyond = m + e[0] * minors[0] + e[3] * minors[3] + e[5] * minors[5], factor = Law::needs > 0 ? t.p / (1.0 + i1 + beyond) : V{};
   V pressure = t.rest;
   if (Law::has_W2) pressure += 2.0 * t.W2 * i1;
+  if (Law::needs > 0) pressure -= factor * beyond;
   for (int v = 0; v < 6; ++v) {
     S[v] = v < 3 ? pressure : V{};
     if (Law::has_W2) S[v] -= 2.0 * t.W2 * e[v];
-  }
-  if (Law::needs > 0) {  // - p e X, X = C^-1
-    const V square = i1 + (m0 + m1_ + m2) + e[0] * m0 - e[3] * (e[3] * e[2] - e[4] * e[5]) + e[5] * (e[3] * e[4] - e[1] * e[5]);
-    const V factor = t.p / (1.0 + square);
-    const V X[6] = {1.0 + e[1] + e[2] + m0,     1.0 + e[0] + e[2] + m1_,    1.0 + e[0] + e[1] + m2,
-                    e[4] * e[5] - e[3] - e[3] * e[2], e[3] * e[5] - e[4] - e[0] * e[4], e[3] * e[4] - e[5] - e[1] * e[5]};
-    for (int v = 0; v < 6; ++v) {
-      const int i = first[v], k = second[v];
-      S[v] -= factor * (e[place[i][0]] * X[place[0][k]] + e[place[i][1]] * X[place[1][k]] + e[place[i][2]] * X[place[2][k]]);
-    }
+    if (Law::needs > 0) S[v] -= factor * (e[v] - minors[v]);
   }
   for (int i = 0; i < 3; ++i)
     for (int k = 0; k < 3; ++k) {
@@ -422,7 +432,7 @@ template <class Law, int A> double internal_force(const Cells& cells, const doub
 }
 // Add the volume integral of H over the cells of each node, (N, 9).
 inline void add_node_gradients(const Cells& cells, const double* u, double* sums) {
-  double ue[3 * MOST_NODES * L], lanes[9 * L];
+  double ue[3 * MOST_NODES * L], lanes[W], rows[9 * L];
   const int n = cells.nodes;
   for (int block = 0; block < cells.blocks; ++block) {
     gather<0>(cells, block, u, ue);
@@ -430,12 +440,15 @@ inline void add_node_gradients(const Cells& cells, const double* u, double* sums
     for (int l = 0; l < L; l += W) {
       V H[9];
       gradient<0>(ue + l, integral + l, n, H);
-      for (int r = 0; r < 9; ++r) store(lanes + r * L + l, H[r]);
+      for (int r = 0; r < 9; ++r) {
+        store(lanes, H[r]);
+        for (int k = 0; k < W; ++k) rows[9 * (l + k) + r] = lanes[k];
+      }
     }
     const int* dofs = cells.dofs.data() + std::size_t(block) * n * L;
     for (int l = 0; l < std::min(L, cells.count - block * L); ++l)
       for (int a = 0; a < n; ++a)
-        for (int r = 0; r < 9; ++r) sums[3 * dofs[a * L + l] + r] += lanes[r * L + l];
+        for (int r = 0; r < 9; ++r) sums[3 * dofs[a * L + l] + r] += rows[9 * l + r];
   }
 }
 
@@ -476,7 +489,7 @@ class File {
     at_ = content_.data() + 8, end_ = data_ = at_ + length;
     available_ = std::size_t(size) - 8 - std::size_t(length);
     read_header();
-    if (metadata("format") != "dpl runtime 1") fail("has another format than dpl runtime 1; export the run again");
+    if (metadata("format") != "dpl runtime 2") fail("has another format than dpl runtime 2; export the run again");
     const std::string stored = metadata("crc32"), key = "\"crc32\":\"";
     const auto place = std::search(content_.begin(), content_.begin() + 8 + std::ptrdiff_t(length), key.begin(), key.end());
     if (stored.size() != 8 || content_.end() - place < 24) fail("is damaged: it has no checksum");
@@ -503,7 +516,8 @@ class File {
   template <class T> std::vector<T> read(const std::string& name, const std::string& shape) {
     const Entry& found = entry(name);
     const char* dtype = std::is_same<T, double>::value ? "F64" : std::is_same<T, float>::value ? "F32"
-                        : std::is_same<T, std::int32_t>::value ? "I32" : std::is_same<T, std::int64_t>::value ? "I64" : "U8";
+                        : std::is_same<T, std::int32_t>::value ? "I32" : std::is_same<T, std::int64_t>::value ? "I64"
+                        : std::is_same<T, std::int16_t>::value ? "I16" : "U8";
     if (found.dtype != dtype || found.shape.size() != shape.size()) fail(name + " has another type");
     std::size_t count = 1;
     for (std::size_t k = 0; k < shape.size(); ++k) {
@@ -642,40 +656,43 @@ class File {
 // ---------------------------------------------------------------- K(0)^-1 by static condensation
 struct Condensed {  // dpl.fem.linear.condensation; one matrix for each of M parities
   std::vector<std::int64_t> table;  // (S, 4)
-  std::vector<std::int32_t> unknowns;
-  std::vector<float> values;     // (M, V), or
-  std::vector<double> exact;     // where float32 loses too much
-  std::size_t length = 0;        // V
-  int most = 0;                  // largest number of unknowns of a front
+  std::vector<std::int32_t> unknowns;  // (T,)
+  std::vector<std::int16_t> values;    // (M, V), times
+  std::vector<float> factors;          // of rows and columns (M, 3, T), or
+  Doubles exact, exact_factors;        // where 16 bits lose too much
+  std::size_t length = 0;              // V
+  int most = 0;                        // largest length of the rows of a front
 
-  template <class T> void solve(const T* blocks, double* force, double* solution, double* work) const {
-    double *own = work, *other = work + most;
+  static std::int64_t wide(std::int64_t count) { return (count + 31) / 32 * 32; }  // length of rows, filled with zeros
+
+  template <class Number, class T>
+  void solve(const Number* blocks, const T* of_inverse, T* force, T* solution, std::vector<T>& work) const {
+    const T *of_coupling = of_inverse + unknowns.size(), *columns = of_coupling + unknowns.size();
+    work.resize(2 * std::size_t(most));
+    T *own = work.data(), *other = own + most;
     const int fronts = int(table.size() / 4);
     for (int s = 0; s < fronts; ++s) {
-      const std::int64_t* row = table.data() + 4 * s;
-      const int count = int(row[1] - row[0]), others = int(row[2] - row[1]);
-      const std::int32_t *pivots = unknowns.data() + row[0], *boundary = unknowns.data() + row[1];
+      const std::int64_t *row = table.data() + 4 * s, first = row[0], count = row[1] - first;
+      const std::int32_t* places = unknowns.data();
       bool is_loaded = false;
-      for (int i = 0; i < count; ++i) own[i] = force[pivots[i]], is_loaded = is_loaded || own[i] != 0;
-      double* inner = other + most;
-      std::fill(inner, inner + count, 0.0);
-      if (is_loaded) {
-        const T* block = blocks + row[3];
-        std::fill(other, other + others, 0.0);
-        add_product(own, block, count, count, inner);
-        add_product(own, block + std::size_t(count) * count, count, others, other);
-        for (int j = 0; j < others; ++j) force[boundary[j]] -= other[j];
+      for (std::int64_t i = first; i < row[1]; ++i) solution[places[i]] = 0, is_loaded = is_loaded || force[places[i]] != 0;
+      const Number* block = blocks + row[3];
+      for (int k = 0; k < 2 && is_loaded; ++k) {  // F_II^-1 f, X^T f
+        const T* rows = k ? of_coupling : of_inverse;
+        const std::int64_t begin = row[k], end = row[k + 1], width = wide(end - begin);
+        for (std::int64_t i = 0; i < count; ++i) own[i] = rows[first + i] * force[places[first + i]];
+        std::fill(other, other + width, T(0));
+        add_product(own, block, int(count), int(width), other);
+        for (std::int64_t j = begin; j < end; ++j) (k ? force : solution)[places[j]] -= (k ? 1 : -1) * columns[j] * other[j - begin];
+        block += count * width;
       }
-      for (int i = 0; i < count; ++i) solution[pivots[i]] = inner[i];
     }
     for (int s = fronts - 1; s >= 0; --s) {
-      const std::int64_t* row = table.data() + 4 * s;
-      const int count = int(row[1] - row[0]), others = int(row[2] - row[1]);
-      const std::int32_t *pivots = unknowns.data() + row[0], *boundary = unknowns.data() + row[1];
-      for (int j = 0; j < others; ++j) other[j] = solution[boundary[j]];
-      for (int i = 0; i < count; ++i) own[i] = solution[pivots[i]];
-      subtract_product(blocks + row[3] + std::size_t(count) * count, other, count, others, own);
-      for (int i = 0; i < count; ++i) solution[pivots[i]] = own[i];
+      const std::int64_t *row = table.data() + 4 * s, first = row[0], count = row[1] - first, width = wide(row[2] - row[1]);
+      std::fill(own, own + count, T(0)), std::fill(other, other + width, T(0));
+      for (std::int64_t j = row[1]; j < row[2]; ++j) other[j - row[1]] = columns[j] * solution[unknowns[j]];
+      subtract_product(blocks + row[3] + count * wide(count), other, int(count), int(width), own);
+      for (std::int64_t i = 0; i < count; ++i) solution[unknowns[first + i]] += of_coupling[first + i] * own[i];
     }
   }
 };
@@ -810,14 +827,17 @@ class Simulator {
     file.check(file.size('d') == 2 * file.size('b') && b_ % (9 * detail::L) == 0, "map_signs");
     condensed_.table = file.read<std::int64_t>("front_table", "S4");
     condensed_.unknowns = file.indices<int32_t>("front_unknowns", "T", file.size('m'));
-    if (file.is_float32("blocks")) condensed_.values = file.read<float>("blocks", "MV");
-    else condensed_.exact = file.read<double>("blocks", "MV");
+    if (file.is_float32("block_factors")) {
+      condensed_.values = file.read<std::int16_t>("blocks", "MV"), condensed_.factors = file.read<float>("block_factors", "M3T");
+    } else {
+      condensed_.exact = file.read<double>("blocks", "MV"), condensed_.exact_factors = file.read<double>("block_factors", "M3T");
+    }
     condensed_.length = file.size('V');
     const std::int64_t T = std::int64_t(file.size('T')), V = std::int64_t(file.size('V'));
     for (std::size_t s = 0; s < file.size('S'); ++s) {
       const std::int64_t* row = condensed_.table.data() + 4 * s;
       file.check(0 <= row[0] && row[0] <= row[1] && row[1] <= row[2] && row[2] <= T, "front_table");
-      const std::int64_t count = row[1] - row[0], width = row[2] - row[0];
+      const std::int64_t count = row[1] - row[0], width = condensed_.wide(count) + condensed_.wide(row[2] - row[1]);
       file.check(0 <= row[3] && row[3] <= V && (width == 0 || count <= (V - row[3]) / width), "front_table");
       condensed_.most = std::max(condensed_.most, int(width));
     }
@@ -903,7 +923,6 @@ class Simulator {
     u_ = prescribed_;
     is_moved_ = std::any_of(u_.begin(), u_.end(), [](double x) { return x != 0; });
     for (Doubles* parts : {&parts_, &forces_, &solution_}) parts->assign(M * m, 0.0);
-    condensed_work_.assign(3 * std::size_t(condensed_.most), 0.0);
     for (Doubles* parts : {&linear_gradients_, &present_, &features_}) parts->assign(M * b, 0.0);
     stress_.assign(2 * M * b, 0.0), split_.assign(2 * M * b, 0.0), own_.assign(std::size_t(r_), 0.0);
     for (Doubles* c : {&linear_, &total_, &step_, &sum_}) c->assign(std::size_t(R_), 0.0);
@@ -926,14 +945,23 @@ class Simulator {
       }
     }
   }
-  void solve_at_rest() {  // forces_ is overwritten
-    for (int p = 0; p < M_; ++p) {
-      const std::size_t first = std::size_t(p) * m_, block = std::size_t(p) * condensed_.length;
-      double *force = forces_.data() + first, *solution = solution_.data() + first;
-      if (std::all_of(force, force + m_, [](double x) { return x == 0; })) std::fill(solution, solution + m_, 0.0);
-      else if (condensed_.exact.empty()) condensed_.solve(condensed_.values.data() + block, force, solution, condensed_work_.data());
-      else condensed_.solve(condensed_.exact.data() + block, force, solution, condensed_work_.data());
+  template <class Number, class T>
+  void solve_at_rest(const Number* blocks, const T* factors, std::vector<T>& force, std::vector<T>& solution, std::vector<T>& work) {
+    double unit = 0;  // over which float32 holds the forces
+    for (double x : parts_) unit = std::max(unit, std::abs(x));
+    if (!(unit > 0)) unit = 1;
+    force.resize(parts_.size()), solution.resize(parts_.size());
+    for (std::size_t k = 0; k < parts_.size(); ++k) force[k] = T(parts_[k] / unit);
+    for (std::size_t p = 0; p < std::size_t(M_); ++p) {
+      T *own = force.data() + p * m_, *found = solution.data() + p * m_;
+      if (std::all_of(own, own + m_, [](T x) { return x == 0; })) std::fill(found, found + m_, T(0));
+      else condensed_.solve(blocks + p * condensed_.length, factors + 3 * p * condensed_.unknowns.size(), own, found, work);
     }
+    for (std::size_t k = 0; k < parts_.size(); ++k) solution_[k] = unit * double(solution[k]);
+  }
+  void solve_at_rest() {  // set solution_ to that of parts_
+    if (condensed_.exact.empty()) solve_at_rest(condensed_.values.data(), condensed_.factors.data(), float_forces_, float_solution_, float_work_);
+    else solve_at_rest(condensed_.exact.data(), condensed_.exact_factors.data(), forces_, exact_solution_, condensed_work_);
   }
   void set_own(int p, const Doubles& coordinates) {
     for (int k = 0; k < r_; ++k) {
@@ -988,7 +1016,6 @@ class Simulator {
         if (column < R_) sum_[std::size_t(column)] += detail::dot(parts_.data() + std::size_t(p) * m_, modes_.data() + row * m_, m_);
       }
     for (int i = 0; i < R_; ++i) linear_[std::size_t(i)] = detail::dot(sum_.data(), reduced_.data() + std::size_t(i) * R_, R_);
-    forces_ = parts_;
     solve_at_rest();
     set_coordinates();
     for (int p = 0; p < M_; ++p) {
@@ -996,7 +1023,6 @@ class Simulator {
       detail::add_product(own_.data(), modes_.data() + std::size_t(p) * r_ * m_, r_, m_, solution_.data() + std::size_t(p) * m_);
     }
     set_field();
-    
   }
   void set_coordinates() {  // loops.nonlinear_coordinates
     using detail::L;
@@ -1162,7 +1188,6 @@ class Simulator {
       }
     }
     set_parts(residual_);
-    forces_ = parts_;
     solve_at_rest();
     set_field();  // u_ is not needed any more
     double square = 0;
@@ -1181,12 +1206,12 @@ class Simulator {
   detail::Condensed condensed_;
   std::vector<std::uint8_t> free_, loadable_;
   std::vector<std::int32_t> dofs_, columns_, surface_, triangles_, load_nodes_, shape_of_node_;
-  std::vector<float> modes_, gradients_, first_, maps_;
+  std::vector<float> modes_, gradients_, first_, maps_, float_forces_, float_solution_, float_work_;
   Doubles points_, prescribed_, characters_, signs_, scales_, supports_, reduced_, rest_, entry_signs_,
       first_signs_, map_signs_, limits_, error_exponents_, least_sizes_, sample_law_, volumes_, constant_force_, shapes_, span_;
   std::map<std::string, Patch> patches_;
   Answer answer_;
-  Doubles load_, u_, internal_, residual_, reactions_, own_force_, patch_force_, parts_, forces_, solution_, condensed_work_,
+  Doubles load_, u_, internal_, residual_, reactions_, own_force_, patch_force_, parts_, forces_, solution_, exact_solution_, condensed_work_,
       linear_gradients_, present_, features_, stress_, split_, own_, linear_, total_, step_, sum_, q_, right_, wanted_, scratch_,
       gram_, axes_, values_, rest_force_, rows_, gradients_of_nodes_;
 };

@@ -43,7 +43,7 @@ from dpl.system.files import atomic_write
 from dpl.training import TrainedSurrogate
 from dpl.version import ROOT, __version__
 
-FORMAT = "dpl runtime 1"
+FORMAT = "dpl runtime 2"
 FILE, SOURCES = "runtime.safetensors", ("dpl_runtime.hpp", "dpl_c.h", "dpl_c.cpp")
 # in a wheel inside the package, in a checkout in the documentation
 HOME = next(filter(Path.is_dir, [ROOT / "dpl" / "consumers"]), ROOT / "docs" / "consumers")
@@ -123,17 +123,7 @@ def _model(net: Unrolled) -> Arrays:
     orbits, own = arrays.orbits, arrays._asdict()
     del own["orbits"]
     law, inverse, _ = net._at(torch.zeros(1, 0))
-    table, unknowns, *_ = linear.blocks
-    count, fronts = len(linear.blocks.values), range(len(table))
-    blocks = [
-        [
-            np.hstack([a.T.ravel(), b.ravel()])
-            for a, b in (linear.blocks.front(p, k) for k in fronts)
-        ]
-        for p in range(count)
-    ]
-    sizes = [len(block) for block in blocks[0]]
-    table = np.concatenate([table[:, :3], np.cumsum([0, *sizes[:-1]])[:, None]], axis=1)
+    table, unknowns, _, values, block_factors = linear.blocks
     factors = np.append(linear.terms.factors(net.scene.problem.material)[0].numpy(), 1.0)
     return {
         **orbits._asdict(),
@@ -145,7 +135,8 @@ def _model(net: Unrolled) -> Arrays:
         "law_samples": law[1],
         "front_table": table,
         "front_unknowns": unknowns.astype(np.int32),
-        "blocks": np.stack([np.concatenate(own) for own in blocks]).astype(np.float32),
+        "blocks": values,
+        "block_factors": block_factors,
         "error_factor": np.array(net._doubt * math.exp(net.error_factors[0])),
         "error_exponents": net.error_exponents[0].numpy(),
         "least_sizes": net.least_sizes.numpy(),

@@ -190,12 +190,12 @@ class LinearResponse:
         """Return forces (B, N, D) and their linear solutions by parity, (B, M, m) float64 each."""
         runs, _, scales, characters, supports, _ = self._orbits(force.device)
         law = self.scene.problem.material.with_parameters(parameters)
-        factors = self.terms.factors(law).double().expand(force.shape[0], -1)
-        factors = pad(factors, (0, 1), value=1.0)
+        factors = pad(self.terms.factors(law).double(), (0, 1), value=1.0)
         with full_precision(force.device.type):
             rows = force.double().flatten(1).unflatten(1, (-1, self._run)).index_select(1, runs)
             parts = characters @ (scales * rows.flatten(1).unflatten(1, scales.shape))
             right = parts.flatten(1) - factors @ supports
+            factors = factors.expand(right.shape[0], -1)
             if torch.compiler.is_compiling():
                 solved = self.by_tensors(right, factors)
             else:
@@ -233,9 +233,9 @@ class LinearResponse:
             return torch.cat([self.by_tensors(*pair) for pair in both])
 
         def of_node(f: Tensor) -> Tensor:
-            forces = f.unflatten(1, (len(self.blocks.values), -1)).permute(2, 1, 0)
+            forces = f.unflatten(1, (len(self.blocks.values), -1)).permute(1, 2, 0)
             solved = solve_layers(layers, forces.to(layers.layers[0].inverse.dtype))
-            return solved.permute(2, 1, 0).flatten(1).double()
+            return solved.permute(2, 0, 1).flatten(1).double()
 
         if not self.terms.varies:
             size = largest(right)

@@ -346,32 +346,31 @@ def _positions(names: Integers, count: int) -> Integers:
 
 
 def solve_layers(blocks: Layers, right: Tensor) -> Tensor:
-    """Return the solutions (n, P, B) of right-hand sides (n, P, B) of the dtype of the blocks.
+    """Return the solutions (P, n, B) of right-hand sides (P, n, B) of the dtype of the blocks.
 
     Each layer is a product of batches of matrices, for batches, gradients, GPUs and graphs. The
-    unknowns are the first axis, whose rows onnxruntime copies whole, and the batch is the last one,
-    so that one load is a column.
+    batch is the last axis, so that one load is a column, and the unknowns are the axis before, so
+    that blocks of matrices need no transpositions.
     """
-    right = right.unflatten(0, (len(blocks.places), -1))  # (n / c, c, P, B)
-    zero = torch.zeros_like(right[:1])
-    forces = torch.cat([right, zero]).index_select(0, blocks.pivots).flatten(0, 1)
-    sizes = [layer.inverse[0, :, 0].numel() for layer in blocks.layers]
-    passed, solved, inner = zero, zero, []
-    for layer, own in zip(blocks.layers, forces.split(sizes), strict=True):
+    right = right.unflatten(1, (len(blocks.places), -1))  # (P, n / c, c, B)
+    zero = torch.zeros_like(right[:, :1])
+    forces = torch.cat([right, zero], dim=1).index_select(1, blocks.pivots)
+    sizes = [layer.inverse[0, :, 0].numel() // right.shape[2] for layer in blocks.layers]
+    passed, solved, acting = zero, zero, []
+    for layer, own in zip(blocks.layers, forces.split(sizes, dim=1), strict=True):
         if len(layer.received):
-            terms = passed.index_select(0, layer.received.flatten())
-            own = own - terms.unflatten(0, layer.received.shape).sum(0).flatten(0, 1)
-        own = own.unflatten(0, layer.inverse.shape[1:3])  # (k, I, P, B)
-        inner.append(layer.inverse @ own.permute(2, 0, 1, 3))
+            terms = passed.index_select(1, layer.received.flatten())
+            own = own - terms.unflatten(1, layer.received.shape).sum(1)
+        own = own.flatten(1, 2).unflatten(1, layer.inverse.shape[1:3])  # (P, k, I, B)
+        acting.append(own)
         if len(layer.boundary):
-            terms = own.permute(2, 0, 3, 1) @ layer.coupling  # (P, k, B, J)
-            terms = terms.permute(1, 3, 0, 2).reshape(-1, *zero.shape[1:])
-            passed = torch.cat([passed, terms])
-    for layer, own in zip(reversed(blocks.layers), reversed(inner), strict=True):
+            terms = (layer.coupling.mT @ own).flatten(1, 2)  # (P, k J, B)
+            passed = torch.cat([passed, terms.unflatten(1, (-1, right.shape[2]))], dim=1)
+    for layer, own in zip(reversed(blocks.layers), reversed(acting), strict=True):
+        own = layer.inverse @ own
         if len(layer.boundary):
-            outer = solved.index_select(0, layer.boundary).flatten(0, 1)
-            shape = layer.coupling.shape[1], layer.coupling.shape[3]
-            own = own - layer.coupling @ outer.unflatten(0, shape).permute(2, 0, 1, 3)
-        found = own.permute(1, 2, 0, 3).reshape(-1, *zero.shape[1:])
-        solved = torch.cat([solved, found])
-    return solved.index_select(0, blocks.places).flatten(0, 1)
+            outer = solved.index_select(1, layer.boundary).flatten(1, 2)
+            own = own - layer.coupling @ outer.unflatten(1, layer.coupling.shape[1::2])
+        found = own.flatten(1, 2).unflatten(1, (-1, right.shape[2]))
+        solved = torch.cat([solved, found], dim=1)
+    return solved.index_select(1, blocks.places).flatten(1, 2)

@@ -10,10 +10,10 @@ from torch import Tensor
 
 EYE = torch.eye(3, dtype=torch.float64).view(9, 1)
 TRANSPOSE = torch.arange(9).view(3, 3).T.flatten()
-# entries (i+1, j+1), (i+2, j+2), (i+1, j+2), (i+2, j+1) modulo 3 of a matrix, (9,) each
+# entries (i+1, j+1) and (i+1, j+2), and (i+2, j+2) and (i+2, j+1), modulo 3 of a matrix, (18,) each
 MINORS = tuple(
-    torch.tensor([3 * ((i + di) % 3) + (j + dj) % 3 for i, j in np.ndindex(3, 3)])
-    for di, dj in ((1, 1), (2, 2), (1, 2), (2, 1))
+    torch.tensor([3 * ((i + di) % 3) + (j + dj) % 3 for dj in order for i, j in np.ndindex(3, 3)])
+    for di, order in ((1, (1, 2)), (2, (2, 1)))
 )
 # rows of A, of A^T and of B in the terms (k, i, j) of (A B)_ij = sum_k A_ik B_kj, (27,) each
 PLAIN, TRANSPOSED, RIGHT = (
@@ -34,8 +34,9 @@ def transposed(X: Tensor) -> Tensor:
 
 def minors(X: Tensor) -> Tensor:
     """Return cof X in rows."""
-    a, b, c, d = (X.index_select(-2, rows.to(X.device)) for rows in MINORS)
-    return a * b - c * d
+    first, second = (X.index_select(-2, rows.to(X.device)) for rows in MINORS)
+    one, other = (first * second).split(9, dim=-2)
+    return one - other
 
 
 def invariants(X: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

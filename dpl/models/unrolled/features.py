@@ -117,6 +117,16 @@ def by_points(function: Callable[[Tensor], Tensor], H: Tensor) -> Tensor:
     return found.flatten(-2)[:, :, 0].reshape(H.mT.shape).mT
 
 
+def rest_stress(law: Material, H: Tensor) -> Tensor:
+    """Return A(0) : H, the stress of small strains, in rows of H in rows, (B, ..., 9, c)."""
+    law = one_law(law)
+    if not isinstance(law, InvariantBasedMaterial):
+        return by_points(law.rest_stress, H)
+    trace = H[..., ::4, :].sum(dim=-2, keepdim=True)
+    mu, lam = (_in_row(x, trace.flatten(1).unsqueeze(-1), trace) for x in law.moduli_at_rest)
+    return mu * (H + transposed(H)) + lam * trace * EYE.to(H)
+
+
 def _stress(law: Material, H: Tensor, change: Tensor) -> Tensor:
     """Return P(H) - P(0) in rows of H in rows, det F = 1 + change; see `InvariantBasedMaterial`.
 

@@ -224,13 +224,13 @@ class Unrolled(StoredBuffers):
         factors = self.terms.factors(self.terms.problem.material.with_parameters(parameters))
         parts, solved = self.linear.by_parity(force, parameters)  # (B, M, m)
         model, of_samples, places = self._tensors(force.device)
-        right = model.modes.to(parts) @ parts.permute(1, 2, 0)
-        right = right.flatten(0, 1).index_select(0, places)
-        linear = self._stiffness.solve(factors, right.T)  # Galerkin
+        unit = largest(parts.flatten(1))  # over which float32 holds forces, displacements, (B, 1)
+        scaled = (parts.permute(1, 2, 0) / unit.T).to(model.modes)  # (M, m, B)
+        right = (model.modes @ scaled).flatten(0, 1).index_select(0, places)
+        linear = self._stiffness.solve(factors, unit * right.T)  # Galerkin
         padded = pad(linear, (0, 1)).T.index_select(0, model.columns.flatten())
         law = of_samples.with_parameters(parameters)
         c, sizes = nonlinear_coordinates(model, law, padded.unflatten(0, model.columns.shape))
-        unit = largest(parts.flatten(1))  # over which float32 holds the displacements, (B, 1)
         added = (model.modes.mT @ (c / unit.T).to(model.modes)).permute(2, 0, 1)
         solved = solved + unit[..., None] * added
         return (self.prescribed + self.linear.fields(solved)).to(force), sizes

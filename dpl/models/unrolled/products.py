@@ -30,7 +30,7 @@ def nonlinear_coordinates(model: Tensors, law: Material, linear: Tensor) -> tupl
         linear: Coordinates of Galerkin linear solutions, (M, r, B).
     """
     H = _gradients(model, linear)
-    rest = features.by_points(law.rest_stress, H)
+    rest = features.rest_stress(law, H)
     strain = features.rotated_strain(H)
     proposed = _coordinates(model, model.first_map, model.first_signs, strain)
     c = step = limit_step(proposed, linear, model.limits[0], BOTH)
