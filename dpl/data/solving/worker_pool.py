@@ -130,21 +130,24 @@ class _Worker:
     def _start(self) -> None:
         context = spawn_context()
         self.pipe, far_end = context.Pipe()
-        process = context.Process(target=_work, args=(far_end, self._scene), daemon=True)
+        process = context.Process(target=_work, args=(far_end,), daemon=True)
         with block_signals(signal.SIGINT, signal.SIGTERM):
             process.start()
         far_end.close()
         self.process = process
         self.job: LoadKey | None = None
         self.deadline = math.inf
-        self._grace = STARTUP_GRACE
+        # The scene is more than a pipe holds: sent at the start, it would have to be read before
+        # the next process can start, and the imports of the workers would follow one another.
+        self._unsent, self._grace = [self._scene], STARTUP_GRACE
 
     def submit(self, job: LoadKey, limit: float) -> None:
         """Start to solve a load."""
         self.job, self.deadline = job, time.monotonic() + limit + self._grace
-        self._grace = 0.0
+        messages, self._unsent, self._grace = [*self._unsent, job], [], 0.0
         with contextlib.suppress(BrokenPipeError):  # `_wait` detects that it died while idle
-            self.pipe.send(job)
+            for message in messages:
+                self.pipe.send(message)
 
     def kill(self) -> None:
         self.process.kill()
@@ -198,11 +201,12 @@ def _wait(workers: list[_Worker]) -> tuple[list[SolvedLoad], list[LoadKey], list
     return solved, crashed, late
 
 
-def _work(pipe: Connection, scene: Scene) -> None:
-    """Solve the loads that are received until the pipe closes or the parent process ends."""
+def _work(pipe: Connection) -> None:
+    """Receive a scene; solve the loads that follow until the pipe closes or the parent ends."""
     die_with_parent()
     for number in (signal.SIGINT, signal.SIGTERM):  # libraries may have unblocked them
         signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        scene = pipe.recv()
         while True:
             pipe.send(solve_load(scene, pipe.recv()))

@@ -13,18 +13,21 @@ from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load, Solution, evaluate_solution, run_lockstep
 
+NEAR = 0.1  # relative residual below which the rotations of the nodes are kept [-]
+
 
 @dataclass(frozen=True, eq=False)
 class AndersonSolver:
-    """Anderson acceleration of u + M R(u), M the corotated inverse of K(0) at the guess.
+    """Anderson acceleration of u + M R(u), M the corotated inverse of K(0).
 
     An iteration costs one residual and one solve with the stored factor of K(0). It starts from
-    the linear combination of earlier iterates with the smallest residual, which is GMRES on a
-    linear problem. The iteration stops without convergence if the residual does not halve in
-    `window` iterations or an element inverts; continue with Newton then.
+    the linear combination of earlier iterates whose residual does no work in the earlier steps:
+    the one of least energy, as in conjugate gradients, on a linear problem. M rotates with the
+    iterates until the residual is below `NEAR`. The iteration stops without convergence if the
+    residual does not halve in `window` iterations or an element inverts; continue with Newton then.
 
-    Source: Anderson (1965), J. ACM 12; as a multisecant quasi-Newton method: Fang, Saad (2009),
-    Numer. Linear Algebra Appl. 16, equation 24.
+    Source: Anderson (1965), J. ACM 12; as a multisecant quasi-Newton method of type I: Fang, Saad
+    (2009), Numer. Linear Algebra Appl. 16, section 4.
 
     Attributes:
         newton: Solver whose body, tolerance and factor of K(0) are used.
@@ -62,7 +65,7 @@ class AndersonSolver:
         residuals: list[float] = []
         right = step = np.zeros(len(problem.discretisation.free_numbers))
         S, C = np.empty((2, self.memory, len(right)))  # steps, changes of the residual
-        products = np.empty((self.memory, self.memory))  # C C^T
+        products = np.empty((self.memory, self.memory))  # S C^T
         for count in range(self.max_iter + 1):
             evaluation = evaluation or problem.evaluate(u)
             seconds = time.perf_counter() - start
@@ -77,13 +80,13 @@ class AndersonSolver:
             if state.converged or diverges or is_slow:
                 return
             before, right = right, problem.restrict(load.force[0] - evaluation.internal[0])
-            if factor is None:
+            if factor is None or residuals[-1] > NEAR:
                 factor = newton.linear_solver.corotational.at(u)
-                step = factor.apply(right)
-            else:  # from the combination of iterates with the smallest residual
-                k, used = (count - 1) % self.memory, slice(min(count, self.memory))
+            used = slice(min(count, self.memory))
+            if count:
+                k = (count - 1) % self.memory
                 S[k], C[k] = step, right - before
-                products[k, used] = products[used, k] = C[used] @ C[k]
-                weights = np.linalg.lstsq(products[used, used], C[used] @ right, rcond=1e-13)[0]
-                step = factor.apply(right - weights @ C[used]) - weights @ S[used]
+                products[k, used], products[used, k] = C[used] @ S[k], S[used] @ C[k]
+            weights = np.linalg.lstsq(products[used, used], S[used] @ right, rcond=1e-13)[0]
+            step = factor.apply(right - weights @ C[used]) - weights @ S[used]
             u, evaluation = u + problem.extend(step)[None], None
