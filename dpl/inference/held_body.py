@@ -17,6 +17,7 @@ from dpl.fem import (
     estimate_error,
     evaluate_solution,
 )
+from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.error_estimate import PRODUCTS
 from dpl.inference.hybrid import Hybrid
 from dpl.inference.request import Candidate, Request
@@ -129,7 +130,14 @@ class HeldBody:
             error=found.error + missed / largest,
         )
 
-    def wrench_errors(self, candidate: Candidate) -> tuple[Tensor, Tensor]:
+    def moved(self, field: Tensor, frames: CorotatedFactor | None = None) -> Tensor:
+        """Return a displacement (N, D) [-], in the frames of its nodes, with the patch at goal."""
+        frames = frames or self.patch.linear.corotational.at(field[None])
+        return self.patch.moved(field, self.goal, frames)
+
+    def wrench_errors(
+        self, candidate: Candidate, frames: CorotatedFactor | None
+    ) -> tuple[Tensor, Tensor]:
         """Return the estimated relative errors of forces and moments of the parts, (P,) each [-].
 
         The estimates compare them with the forces that balance the stresses, plus the work of the
@@ -138,7 +146,7 @@ class HeldBody:
         """
         patch, u = self.patch, candidate.state.displacement[0]
         assert candidate.force is not None
-        if not candidate.known_error < math.inf:
+        if frames is None or not candidate.known_error < math.inf:
             unknown = torch.full((len(patch.parts),), math.inf, dtype=torch.float64)
             return unknown, unknown
         balance = candidate.state.internal[0] - self.load.force[0]
@@ -146,7 +154,7 @@ class HeldBody:
         if candidate.motion_error:
             reaction = reaction + patch.stiffness_times(self.goal - patch.of_field(u))
         rest = self.newton.problem.acting(balance)
-        change = patch.work(rest, u, self.turns)
+        change = patch.work(rest, frames, self.turns)
         found, balanced = (patch.wrench(patch.at(f), u) for f in (candidate.force, reaction))
         errors = []
         for own, expected, added in zip(found, balanced, change, strict=True):
