@@ -167,7 +167,7 @@ class Gripper:
                 is free to move, a patch that slides faces no axis, or two patches have a node in
                 common.
         """
-        request = Request(tol, budget_ms, None, self._durations, self.warm)
+        request = Request(tol, budget_ms, None, self._durations)
         load = self._load(force, young, parameters)
         is_one = not isinstance(region, (list, tuple))
         regions, translations, turns = region, translation, rotation
