@@ -214,8 +214,8 @@ class Gripper:
         """Prepare a patch as far as the budget allows; return True if the call can go on."""
         if patch.is_prepared:
             return True
-        for _ in patch.preparation:
-            if request.over():
+        for _ in self._durations.each("preparation", patch.preparation):
+            if request.over("preparation"):
                 return False
         return not request.over("start")
 
