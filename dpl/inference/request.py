@@ -60,8 +60,8 @@ class Durations:
     """Wall times of the stages of earlier calls, which forecast the next time of each stage.
 
     The forecast is the second largest of the last `RECENT` times, of two the largest: nine of ten
-    further times are below it if they are drawn from the same distribution. A stage that does not fit is tried in one
-    of `PATIENCE` calls, so that one slow call does not prevent it for ever.
+    further times are below it if they are drawn from the same distribution. A stage that does not
+    fit is tried in one of `PATIENCE` calls, so that one slow call does not prevent it for ever.
     """
 
     def __init__(self) -> None:
