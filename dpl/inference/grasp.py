@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dpl.fem import Load, RigidPatch, evaluate_solution
-from dpl.fem.solvers.rigid_patch import rotations
+from dpl.fem.solvers.corotational import CorotatedFactor
+from dpl.fem.solvers.rigid_patch import rotation_gradients
 from dpl.inference.answer import UNRELIABLE, Answer, RangeCheck, answer_of, relative
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.held_body import MAX_ITER, MOTION_TOL, HeldBody
@@ -86,6 +87,7 @@ class Grip(NamedTuple):
     motion: Tensor  # translations over L [-] and rotation vectors [rad], (P, R)
     force: Tensor  # of the gripper at held degrees of freedom, (m,) [-]
     field: Tensor  # displacement, (N, D) [-]
+    frames: CorotatedFactor | None = None  # with the rotations of the nodes there, if computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +167,7 @@ class Gripper:
                 is free to move, a patch that slides faces no axis, or two patches have a node in
                 common.
         """
-        request = Request(tol, budget_ms, None, self._durations, self.warm)
+        request = Request(tol, budget_ms, None, self._durations)
         load = self._load(force, young, parameters)
         is_one = not isinstance(region, (list, tuple))
         regions, translations, turns = region, translation, rotation
@@ -201,19 +203,19 @@ class Gripper:
                 solved = body.equilibrium(best, request)
                 best = min(best, solved, key=lambda one: (not one.is_exact, one.known_error))
             with self._durations.timed(FINISH):
+                frames = patch.linear.corotational.at(best.state.displacement)
                 is_near = request.spent or reached.known_error <= UNRELIABLE
                 if is_near and reached.force is not None:
-                    self._last.append(
-                        Grip(patch, motion, reached.force, reached.state.displacement[0])
-                    )
-                return self._reported(body, load, best, request, is_one=is_one)
+                    field = reached.state.displacement[0]
+                    self._last.append(Grip(patch, motion, reached.force, field, frames))
+                return self._reported(body, load, best, request, frames, is_one=is_one)
 
     def _is_prepared(self, patch: RigidPatch, request: Request) -> bool:
         """Prepare a patch as far as the budget allows; return True if the call can go on."""
         if patch.is_prepared:
             return True
-        for _ in patch.preparation:
-            if request.over():
+        for _ in self._durations.each("preparation", patch.preparation):
+            if request.over("preparation"):
                 return False
         return not request.over("start")
 
@@ -221,7 +223,7 @@ class Gripper:
         """Return the body with a patch at a motion; its law has the parameters of the load."""
         dim = patch.held.shape[1]
         goal = patch.displacement(motion[:, :dim], motion[:, dim:])
-        turns = torch.from_numpy(rotations(motion[:, dim:], dim).as_matrix()[:, :dim, :dim])
+        turns = rotation_gradients(motion[:, dim:], dim) + torch.eye(dim)
         newton = patch.newton(self.scene.corrector, goal)
         newton = newton if request.tol is None else replace(newton, tol=request.tol)
         return HeldBody(patch, goal, turns, Load(load.force, load.young), newton)
@@ -258,15 +260,16 @@ class Gripper:
         self, end: HeldBody, start: Grip, motion: Tensor, parts: int, load: Load, request: Request
     ) -> Candidate | None:
         """Return the state after a motion in equal parts; None if one is inverted or time is up."""
-        field, count, change = start.field, 0, motion - start.motion
+        field, frames, count, change = start.field, start.frames, 0, motion - start.motion
         for k in range(1, parts + 1):
             body = end
             if k < parts:
                 body = self._held(end.patch, start.motion + (k / parts) * change, load, request)
-            found = body.corrected(end.patch.moved(field, body.goal), self.steps, request)
+            found = body.corrected(body.moved(field, frames), self.steps, request)
             if found is None or (k < parts and request.over("step")):
                 return None
-            field, count = found.state.displacement[0], count + int(found.state.iterations)
+            field, frames = found.state.displacement[0], None
+            count += int(found.state.iterations)
             best = found._replace(state=found.state._replace(iterations=torch.tensor([count])))
         return best
 
@@ -293,7 +296,7 @@ class Gripper:
         )  # fmt: skip
         best = None
         if self.steps:
-            best = body.corrected(patch.moved(field, body.goal), self.steps, request)
+            best = body.corrected(body.moved(field), self.steps, request)
         if best is None:
             if not is_found:
                 added = patch.stiffness_times(body.goal - patch.of_field(field))
@@ -354,14 +357,21 @@ class Gripper:
         return patch
 
     def _reported(
-        self, body: HeldBody, load: Load, held: Candidate, request: Request, *, is_one: bool
+        self,
+        body: HeldBody,
+        load: Load,
+        held: Candidate,
+        request: Request,
+        frames: CorotatedFactor | None = None,
+        *,
+        is_one: bool,
     ) -> GraspAnswer:
         """Return a candidate as an answer in SI units."""
         scene, state = self.scene, held.state
         unit, dim = float(load.young) * scene.force_unit, scene.problem.shape[1]
         assert held.force is not None
         patch, nodal = body.patch, body.patch.at(held.force)
-        parts = *patch.wrench(nodal, state.displacement[0]), *body.wrench_errors(held)
+        parts = *patch.wrench(nodal, state.displacement[0]), *body.wrench_errors(held, frames)
         force, moment, *errors = (part[0] if is_one else part for part in parts)
         count = 6 if dim == 3 else 3
         arms = torch.where(torch.arange(count * len(patch.parts)) % count < dim, 1.0, scene.length)

@@ -17,16 +17,15 @@ from dpl.fem import (
     estimate_error,
     evaluate_solution,
 )
-from dpl.fem.solvers.error_estimate import PRODUCTS
+from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.inference.hybrid import Hybrid
 from dpl.inference.request import Candidate, Request
 
 MOTION_TOL = 1e-3  # largest error of a motion that is accepted, over its size [-]
 MAX_ITER = 16  # predictions for a motion
 MEMORY = 8  # iterations from which Anderson's method extrapolates
-CORRECTED = 3e-5  # relative error of a displacement below which its correction ends [-]
-CORRECTED_WARM = 1e-4  # the same of the frames of a moving hand [-]
-LEAST_RATE = 0.2  # smallest contraction of errors that the estimates of a moving hand assume [-]
+CORRECTED = 3e-4  # estimated error of a displacement below which its correction ends [-]
+LEAST_RATE = 0.3  # smallest contraction of errors that this estimate assumes [-]
 CONTRACTION = 0.5  # ratio of residuals below which a correction contracts [-]
 
 
@@ -104,9 +103,7 @@ class HeldBody:
     def with_errors(self, candidate: Candidate, request: Request) -> Candidate:
         """Return a candidate with the forces of the gripper and its errors, estimated if in time.
 
-        A correction that has contracted shows that the preconditioner is near the inverse of the
-        tangent. The estimate then needs no products with the tangent. A moving hand has the error
-        of its last correction, see `corrected`.
+        A correction that has contracted to `CORRECTED` has its own estimate, see `corrected`.
         """
         patch, state, u = self.patch, candidate.state, candidate.state.displacement
         force = candidate.force
@@ -114,22 +111,24 @@ class HeldBody:
             force = patch.of_field(state.internal[0] - self.load.force[0])
         missed = float(patch.at(self.goal - patch.of_field(u[0])).norm(dim=1).max())
         candidate = candidate._replace(force=force, motion_error=missed)
-        if request.warm and candidate.known_error < CORRECTED_WARM:
+        if candidate.known_error < CORRECTED or request.over("errors"):
             return candidate
-        if request.over("errors"):
-            return candidate
-        products = 0 if candidate.known_error < CORRECTED_WARM else PRODUCTS
         with request.durations.timed("errors"):
-            found = estimate_error(
-                self.newton.linear_solver, self.load, u, state.evaluation, products=products
-            )
+            found = estimate_error(self.newton.linear_solver, self.load, u, state.evaluation)
         largest = max(float(u.norm(dim=2).max()), 1e-300)
         return candidate._replace(
             state=state.unstable() if found.is_indefinite else state,
             error=found.error + missed / largest,
         )
 
-    def wrench_errors(self, candidate: Candidate) -> tuple[Tensor, Tensor]:
+    def moved(self, field: Tensor, frames: CorotatedFactor | None = None) -> Tensor:
+        """Return a displacement (N, D) [-], in the frames of its nodes, with the patch at goal."""
+        frames = frames or self.patch.linear.corotational.at(field[None])
+        return self.patch.moved(field, self.goal, frames)
+
+    def wrench_errors(
+        self, candidate: Candidate, frames: CorotatedFactor | None
+    ) -> tuple[Tensor, Tensor]:
         """Return the estimated relative errors of forces and moments of the parts, (P,) each [-].
 
         The estimates compare them with the forces that balance the stresses, plus the work of the
@@ -138,7 +137,7 @@ class HeldBody:
         """
         patch, u = self.patch, candidate.state.displacement[0]
         assert candidate.force is not None
-        if not candidate.known_error < math.inf:
+        if frames is None or not candidate.known_error < math.inf:
             unknown = torch.full((len(patch.parts),), math.inf, dtype=torch.float64)
             return unknown, unknown
         balance = candidate.state.internal[0] - self.load.force[0]
@@ -146,7 +145,7 @@ class HeldBody:
         if candidate.motion_error:
             reaction = reaction + patch.stiffness_times(self.goal - patch.of_field(u))
         rest = self.newton.problem.acting(balance)
-        change = patch.work(rest, u, self.turns)
+        change = patch.work(rest, frames, self.turns)
         found, balanced = (patch.wrench(patch.at(f), u) for f in (candidate.force, reaction))
         errors = []
         for own, expected, added in zip(found, balanced, change, strict=True):
@@ -159,11 +158,10 @@ class HeldBody:
         """Return the iterate of least residual from a guess (N, D); None if that is inverted.
 
         Iterations with the corotated factor of K(0) end with the budget, or when the error is below
-        `CORRECTED`, with `warm` `CORRECTED_WARM`: the last change times the ratio of the residuals
-        after and before it, if this ratio is below `CONTRACTION`. Soft errors contract more slowly
-        than residuals, so that `warm` states, whose error this is, assume at least `LEAST_RATE`.
+        `CORRECTED`: the last change times the ratio of the residuals after and before it, if this
+        ratio is below `CONTRACTION`. Soft errors contract more slowly than residuals, so that the
+        ratio counts as at least `LEAST_RATE`.
         """
-        enough, least = (CORRECTED_WARM, LEAST_RATE) if request.warm else (CORRECTED, 0.0)
         valid: list[Solution] = []
         error = math.inf
         iterates = AndersonSolver(self.newton, max_iter=steps).iterate(self.load, guess=guess[None])
@@ -177,8 +175,8 @@ class HeldBody:
                 before, u = valid[-2], state.displacement
                 ratio = float(state.residual / before.residual)
                 change = float((u - before.displacement).norm() / u.norm())
-                error = change * (max(ratio, least) if ratio < CONTRACTION else 1.0)
-                if ratio < CONTRACTION and error < enough:
+                error = change * (max(ratio, LEAST_RATE) if ratio < CONTRACTION else 1.0)
+                if ratio < CONTRACTION and error < CORRECTED:
                     break
             if len(valid) <= steps and request.over("step"):
                 break

@@ -3,7 +3,7 @@
 import math
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
@@ -21,7 +21,7 @@ EXACT = 1e-12  # error of a motion that counts as met exactly [-]
 SUFFICIENT = 2e-3  # estimated relative error above which predictions are corrected [-]
 FINISH = "finish"  # stage between the last iteration of a call and its answer
 RECENT = 20  # times of a stage from which the next one is forecast
-DECAY = 0.9  # of a forecast that prevents its stage, so that one slow call does not for ever
+PATIENCE = 1000  # calls that a forecast prevents a stage in, one after the other, until it is tried
 
 
 class Guess(NamedTuple):
@@ -59,17 +59,20 @@ class Candidate(NamedTuple):
 class Durations:
     """Wall times of the stages of earlier calls, which forecast the next time of each stage.
 
-    The forecast is the second largest of the last `RECENT` times, of fewer times the largest: nine
-    of ten further times are below it if they are drawn from the same distribution.
+    The forecast is the second largest of the last `RECENT` times, of two the largest: nine of ten
+    further times are below it if they are drawn from the same distribution. A stage that does not
+    fit is tried in one of `PATIENCE` calls, so that one slow call does not prevent it for ever.
     """
 
     def __init__(self) -> None:
         """Begin without times; the forecast of a stage that was never timed is 0."""
         self._recent: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RECENT))
+        self._prevented: dict[str, int] = defaultdict(int)  # since the last run of each stage
 
     def add(self, stage: str, seconds: float) -> None:
         """Add a time of a stage [s]."""
         self._recent[stage].append(seconds)
+        self._prevented[stage] = 0
 
     def each(self, stage: str, items: Iterable[T]) -> Iterator[T]:
         """Yield items, and add the time from each one to the next."""
@@ -90,7 +93,15 @@ class Durations:
     def forecast(self, stage: str) -> float:
         """Return the time of the next run of a stage [s]."""
         times = sorted(self._recent[stage])
-        return times[-2 if len(times) == RECENT else -1] if times else 0.0
+        return times[-2 if len(times) > 2 else -1] if times else 0.0
+
+    def prevents(self, stages: Sequence[str], seconds: float) -> bool:
+        """Return True if stages that follow each other take longer, and the first has to wait."""
+        first, *others = map(self.forecast, stages)
+        is_long = first + sum(others) > seconds
+        self._prevented[stages[0]] += is_long
+        is_tried = self._prevented[stages[0]] > PATIENCE
+        return is_long and not (is_tried and sum(others) <= seconds)
 
 
 @dataclass
@@ -169,14 +180,10 @@ class Request:
     def over(self, *stages: str) -> bool:
         """Return True if the next stages and the end of the call exceed the budget.
 
-        The caller then ends. The forecast of the first of them, if there is one, decreases. Without
-        stages the next one takes too little to be forecast.
+        The caller then ends. Without stages the next one takes too little to be forecast.
         """
         if self.budget_ms is None:
             return False
-        forecasts = list(map(self.durations.forecast, (*stages, FINISH)))
-        is_over = sum(forecasts) > self.seconds_left
-        if is_over and stages and forecasts[0]:  # zeros would displace times
-            self.durations.add(stages[0], DECAY * forecasts[0])
+        is_over = self.durations.prevents((*stages, FINISH), self.seconds_left)
         self.spent |= is_over
         return is_over

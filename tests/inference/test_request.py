@@ -59,7 +59,7 @@ def test_calls_whose_stages_take_random_times_keep_their_budget(monkeypatch, bud
         with durations.timed(stage):
             now[0] += 1e-3 * milliseconds * rng.lognormal(sigma=0.2)
 
-    late = iterations = 0
+    late = iterations = tried = 0
     for _ in range(1000):
         request = Request(budget_ms=budget, durations=durations)
         run("prediction", 1.0)
@@ -68,9 +68,11 @@ def test_calls_whose_stages_take_random_times_keep_their_budget(monkeypatch, bud
             iterations += 1
         if not request.over("Newton"):
             run("Newton", 100.0)
+            tried += 1
         run(FINISH, 1.0)
         late += 1e3 * (now[0] - request.begin) > 1.2 * budget
     assert 1 <= late <= 10
+    assert tried == 1
     assert iterations > 1000 * (budget - 4)
 
 

@@ -1,5 +1,6 @@
 """Patches of the boundary that grippers hold: rigid motions, compliance, the held body."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -10,19 +11,21 @@ import numpy as np
 import skfem
 import torch
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import pad
 
 from dpl.fem.linear.interface import Array, Factor
 from dpl.fem.mesh.regions import Region, nodes_in
 from dpl.fem.problem import Evaluation, Problem
+from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.newton import Newton
 
 RTOL = 1e-6  # relative residual of the linear solutions that give the compliance [-]
 RIGID = 0.1  # part of a displacement of the patch that is no rigid motion and is neglected [-]
 FACING = 0.966  # smallest cosine, of 15 degrees, between a facet's normal and the axis it faces [-]
+UNITS = torch.eye(3, dtype=torch.float64)
+CROSS = torch.linalg.cross(UNITS[:, None], UNITS[None])  # x @ CROSS[k] is the product e_k x x
 
 
 class Wrench(NamedTuple):
@@ -94,6 +97,8 @@ class RigidPatch:
         Raises:
             ValueError: Two patches have a node in common.
         """
+        if len(patches) == 1:
+            return patches[0]
         parts = torch.cat([patch.parts for patch in patches])
         if (parts.sum(dim=0) > 1).any():
             raise ValueError("region: two patches have a node in common; grasp them apart")
@@ -118,33 +123,27 @@ class RigidPatch:
         """
         dim = self.held.shape[1]
         translations = torch.as_tensor(translation, dtype=torch.float64).reshape(-1, dim)
-        turns = rotations(torch.as_tensor(rotation, dtype=torch.float64), dim).as_quat()
+        gradients = rotation_gradients(torch.as_tensor(rotation, dtype=torch.float64), dim)
         field = torch.zeros(self.held.shape, dtype=torch.float64)
-        for part, moved, turn in zip(self.parts, translations, turns, strict=True):
-            quaternion = torch.from_numpy(turn)
-            axis, cosine = quaternion[None, :3], quaternion[3]
-            # (R - I) r without the rounding of R, which exceeds a small rotation
-            across = torch.linalg.cross(axis, self._arms(part))
-            turned = 2 * (cosine * across + torch.linalg.cross(axis, across))
-            field[part] = turned[:, :dim] + moved
+        for nodes, moved, gradient in zip(self._numbers, translations, gradients, strict=True):
+            field[nodes] = arms_of(self.problem.points[nodes]) @ gradient.mT + moved
         return self.of_field(field)
 
-    def _arms(self, part: Tensor) -> Tensor:
-        """Return the nodes of a part relative to their mean, (k, 3) [-]; 2D: with zeros."""
-        points = self.problem.points[part]
-        return pad(points - points.mean(dim=0), (0, 3 - points.shape[1]))
+    @cached_property
+    def _numbers(self) -> list[Tensor]:
+        """Numbers of the nodes of each part, (k,)."""
+        return [part.nonzero()[:, 0] for part in self.parts]
 
     @cached_property
     def rigid_motions(self) -> Tensor:
         """Displacements (m, P R) by unit translations and rotations of the parts, one by one."""
         dim, columns = self.held.shape[1], []
-        for part in self.parts:
-            arms, units = self._arms(part), torch.eye(3, dtype=torch.float64)
-            turned = [torch.linalg.cross(axis[None].expand_as(arms), arms) for axis in units]
-            moved = [axis.expand_as(arms) for axis in units[:dim]]
-            for one in (*moved, *turned[0 if dim == 3 else 2 :]):
+        for nodes in self._numbers:
+            arms = arms_of(self.problem.points[nodes])
+            turned = [arms @ product[:dim, :dim] for product in CROSS[0 if dim == 3 else 2 :]]
+            for one in (*torch.eye(dim, dtype=torch.float64), *turned):
                 field = torch.zeros(self.held.shape, dtype=torch.float64)
-                field[part] = one[:, :dim]
+                field[nodes] = one
                 columns.append(self.of_field(field))
         return torch.stack(columns, dim=1)
 
@@ -234,13 +233,13 @@ class RigidPatch:
         frame = torch.block_diag(*(matrix for pair in pairs for matrix in pair))
         return frame @ self._stiffness @ frame.mT
 
-    def work(self, force: Tensor, displacement: Tensor, turns: Tensor) -> Wrench:
+    def work(self, force: Tensor, frames: CorotatedFactor, turns: Tensor) -> Wrench:
         """Return the work of nodal forces (N, D) [-] by unit motions of the parts.
 
-        The fields are `rigid_fields` in the rotated frames of the nodes at a displacement (N, D),
-        and the motions those of parts that are turned, (P, D, D).
+        The fields are `rigid_fields` in rotated frames of the nodes, and the motions those of parts
+        that are turned, (P, D, D).
         """
-        dim, frames = force.shape[1], self.linear.corotational.at(displacement[None])
+        dim = force.shape[1]
         works = self.rigid_fields @ frames.local(self.problem.restrict(force))
         along, about = torch.from_numpy(works.reshape(len(turns), -1, 1)).split(dim, dim=1)
         about = turns @ about if dim == 3 else about
@@ -271,14 +270,14 @@ class RigidPatch:
         factor = None if iterates else _HeldFactor(self)
         return LinearSolver(body, self.linear.tol, self.linear.linear, approximate=factor)
 
-    def moved(self, displacement: Tensor, goal: Tensor) -> Tensor:
+    def moved(self, displacement: Tensor, goal: Tensor, frames: CorotatedFactor) -> Tensor:
         """Return a displacement (N, D) whose patch is at a goal (m,), from one near it [-].
 
-        The difference is a linear displacement in the rotated frames of the nodes. It is a sum of
+        The difference is a linear displacement in rotated frames of the nodes. It is a sum of
         `rigid_fields` if the parts move by rigid motions, up to `RIGID` of the distance: a support
         that jumps by the rest is at the goal, and the next correction removes its stresses.
         """
-        problem, frames = self.problem, self.linear.corotational.at(displacement[None])
+        problem = self.problem
         missing = problem.restrict(self.at(goal - self.of_field(displacement)))
         gap = torch.from_numpy(frames.local(missing)[self.places])
         motions = self._motions_of @ gap
@@ -299,13 +298,13 @@ class RigidPatch:
 
     def wrench(self, force: Tensor, displacement: Tensor) -> Wrench:
         """Return the resultants of forces (N, D) [-] on the parts at a displacement (N, D) [-]."""
-        resultants, moments, missing = [], [], 3 - force.shape[1]
-        for part in self.parts:
-            place = (self.problem.points + displacement)[part]
-            arms = pad(place - place.mean(dim=0), (0, missing))
-            moment = torch.linalg.cross(arms, pad(force[part], (0, missing))).sum(dim=0)
-            resultants.append(force[part].sum(dim=0))
-            moments.append(moment[2:] if missing else moment)
+        resultants, moments = [], []
+        i, j = ([1, 2, 0], [2, 0, 1]) if force.shape[1] == 3 else ([0], [1])
+        for part in self._numbers:
+            own, arms = force[part], arms_of(self.problem.points[part] + displacement[part])
+            products = arms.mT @ own
+            resultants.append(own.sum(dim=0))
+            moments.append(products[i, j] - products[j, i])
         return Wrench(torch.stack(resultants), torch.stack(moments))
 
 
@@ -342,10 +341,22 @@ class _HeldFactor(Factor):
         return factor.solve(force)[~held]
 
 
-def rotations(vectors: Tensor, dim: int) -> Rotation:
-    """Return rotations by vectors (P, 3), in 2D by angles (P, 1) [rad]."""
+def rotation_gradients(vectors: Tensor, dim: int) -> Tensor:
+    """Return R - I, (P, D, D), of rotations R by vectors (P, 3), in 2D by angles (P, 1) [rad].
+
+    The rounding of R itself would exceed a small rotation. With the unit quaternion (q, c) and the
+    matrix Q of the product with q, R - I = 2 (c Q + Q Q).
+    """
     vectors = vectors.reshape(-1, 3 if dim == 3 else 1)
-    return Rotation.from_rotvec(pad(vectors, (3 - vectors.shape[1], 0)).numpy())
+    half = 0.5 * vectors.norm(dim=1)[:, None, None]
+    Q = torch.tensordot(pad(vectors, (3 - vectors.shape[1], 0)), CROSS, dims=1).mT
+    Q = 0.5 * torch.sinc(half / math.pi) * Q
+    return (2 * (half.cos() * Q + Q @ Q))[:, :dim, :dim]
+
+
+def arms_of(points: Tensor) -> Tensor:
+    """Return points (k, D) relative to their mean."""
+    return points - points.mean(dim=0)
 
 
 def flat_part(problem: Problem, nodes: Tensor) -> tuple[Tensor, int]:
