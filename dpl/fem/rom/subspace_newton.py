@@ -24,8 +24,7 @@ MIN_DETF_RATIO = 0.2  # a step must leave this part of min det F [-]
 MAX_SHIFT = 1e-3  # distance from the minimum of the energy to which steps converge, over ||u|| [-]
 LEAST_EIGENVALUE = 1e-2  # of an indefinite reduced tangent relative to that at rest [-]
 
-# coordinates in W, (R,); inverse tangent plus shift; shift, (R,)
-_Correction = tuple[Array, Callable[[Array], Array], Array]
+_Correction = tuple[Array, Callable[[Array], Array], Array]  # in W; from a residual; its shift
 
 
 class SubspaceState(NamedTuple):
@@ -201,19 +200,10 @@ class SubspaceNewton:
             yield best._replace(iterations=state.iterations)
 
     def _correction(
-        self,
-        problem: Problem,
-        load: Load,
-        state: SubspaceState,
-        shift: Array | None = None,
-        *,
-        whole: bool = False,
-    ) -> _Correction | None:
-        """Return Newton's correction, None where an element is inverted.
-
-        The correction is increased by a shift, by default the one that follows from `gains`. With
-        `whole` the tangent is that of all cells.
-        """
+        self, problem: Problem, load: Load, state: SubspaceState, shift: Array | None = None,
+        *, whole: bool = False,
+    ) -> _Correction | None:  # fmt: skip
+        """Return Newton's correction, None where an element is inverted; `whole`: of all cells."""
         if not state.evaluation.volume_ratio > 0:
             return None
         right = self._reduced_residual(load, state.evaluation)
@@ -229,14 +219,9 @@ class SubspaceNewton:
         """Return M s_0 in coordinates of W, (R,), of the first correction (R,)."""
         if self.gains is None:
             return np.zeros_like(y)
-        shift: Array = self._white_gains @ y
+        scale = self.tangent.scale
+        shift: Array = solve_triangular(scale, self.gains.numpy() @ (scale @ y))
         return shift * min(1.0, MAX_SHIFT / max(self._relative(shift, displacement), 1e-300))
-
-    @cached_property
-    def _white_gains(self) -> Array:
-        """M in coordinates of W, (R, R)."""
-        assert self.gains is not None
-        return solve_triangular(self.tangent.scale, self.gains.numpy() @ self.tangent.scale)
 
     def _step(
         self,

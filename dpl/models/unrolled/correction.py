@@ -15,7 +15,6 @@ RANKS = (60, 100, 160)  # numbers of modes that are tried, and all modes
 CANDIDATES = 600  # cells to choose from
 STATES = 64  # equilibria at which cells are chosen
 TOLERANCES = (3e-2, 3e-3)  # of the reduced forces of these cells, coarse and fine [-]
-USUAL = 100  # modes beyond which a step takes much longer
 WORTH = 0.75  # ratio of errors after one step below which more modes or cells are worth their time
 MAX_STEPS = 6  # also of the simulator
 LOADS = 50  # held-out loads whose errors after all steps are measured
@@ -56,17 +55,13 @@ def fit_errors(sizes: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def choose_newton(
-    problem: Problem,
-    modes: tuple[Tensor, Tensor],
-    samples: Sample,
-    predicted: Tensor,
-    held_out: Sample,
-    guesses: Tensor,
-) -> tuple[SubspaceNewton, Tensor]:
+    problem: Problem, modes: tuple[Tensor, Tensor], samples: Sample, predicted: Tensor,
+    held_out: Sample, guesses: Tensor,
+) -> tuple[SubspaceNewton, Tensor]:  # fmt: skip
     """Return Newton's method in the number of modes that suits the loads best.
 
     More modes are taken, and at last more cells, where one step then leaves a mean error below
-    `WORTH` times the other on samples whose predictions do not know them; more than `USUAL` only
+    `WORTH` times the other on samples whose predictions do not know them; more than 100 only
     where `MAX_STEPS` steps leave a held-out error above `SUFFICIENT`. There modes that lower the
     largest one are taken, too. The relative errors (S,) of the held-out loads after `MAX_STEPS`
     steps are returned, too.
@@ -82,14 +77,14 @@ def choose_newton(
     candidates = random[:CANDIDATES].sort().values
     states = samples.displacement
     some = states[:: max(1, len(states) // STATES)][:STATES]
-    first, few = (_first(*part) for part in ((samples, len(predicted)), (held_out, LOADS)))
+    few = Sample(*(column[:LOADS] for column in held_out))
     vectors, parity = orthonormal_fields(modes[0], problem.free), modes[1]
 
     def solver(rank: int, tolerance: float) -> tuple[SubspaceNewton, float]:
         found = SubspaceNewton.within(
             problem, vectors[..., :rank], some, tolerance=tolerance, candidates=candidates
         )
-        return with_gains(found, parity[:rank], first, predicted)
+        return with_gains(found, parity[:rank], samples, predicted)
 
     def errors(found: SubspaceNewton) -> Tensor:
         return relative_errors(few, _corrected(found, few, guesses[:LOADS], MAX_STEPS))
@@ -99,7 +94,7 @@ def choose_newton(
     best, error = solver(ranks[0], coarse)
     left = errors(best)
     for rank in ranks[1:]:
-        if rank > USUAL and left.max() < SUFFICIENT:
+        if rank > RANKS[1] and left.max() < SUFFICIENT:
             break
         found, own = solver(rank, coarse)
         if own < WORTH * error:
@@ -113,27 +108,24 @@ def choose_newton(
 def with_gains(
     solver: SubspaceNewton, parity: Tensor, samples: Sample, guesses: Tensor
 ) -> tuple[SubspaceNewton, float]:
-    """Return a solver with gains for predictions (S, N, D), and its weighted mean error.
+    """Return a solver with gains for predictions (S, N, D) of the first samples, and its error.
 
-    The error is that after one step, by gains which are fitted to the other samples.
+    It is the weighted mean after one step, by gains that are fitted to the other samples.
     """
     moved, basis = _corrected(solver, samples, guesses, 1), solver.vectors.flatten(0, 1)
-    steps, rest = ((moved - guesses).flatten(1) @ basis, (samples.displacement - moved).flatten(1))
-    weights, inside = sample_weights(samples.displacement.flatten(1)), rest @ basis
+    truth = samples.displacement[: len(guesses)]
+    steps, rest = (moved - guesses).flatten(1) @ basis, (truth - moved).flatten(1)
+    weights, inside = sample_weights(truth.flatten(1)), rest @ basis
     gains, left = fit_gains(steps, inside, weights, parity)
     outside = rest.square().sum(dim=1) - inside.square().sum(dim=1)
     error = weights * (left.square().sum(dim=1) + outside).clamp(min=0).sqrt()
     return replace(solver, gains=gains), float(error.mean())
 
 
-def _first(samples: Sample, count: int) -> Sample:
-    return Sample(*(column[:count] for column in samples))
-
-
 def _corrected(solver: SubspaceNewton, samples: Sample, guesses: Tensor, steps: int) -> Tensor:
-    """Return displacements (S, N, D) after at most so many steps from guesses (S, N, D)."""
+    """Return displacements (S, N, D) of the first samples after some steps from guesses."""
     found = []
-    for load, guess in zip(samples.load.unbatch(), guesses.split(1), strict=True):
+    for load, guess in zip(samples.load.unbatch(), guesses.split(1), strict=False):
         *_, last = solver.states(load, guess=guess, max_iter=steps, error_tol=ERROR)
         found.append(last.displacement)
     return torch.cat(found)

@@ -28,7 +28,7 @@ NOISE = 5e-7  # singular value over the largest below which a mode is rounding e
 STEPPED = 256  # samples to which the gains of a step are fitted
 LIMIT = 1.5  # factor on the largest ratio of corrections in the samples
 MIN_GAIN = 0.97  # largest ratio of held-out errors for which another map is worth its time
-INSIDE = 0.8  # part of held-out errors inside the modes above which more modes are not tried
+INSIDE = 0.8  # part of held-out errors inside the modes above which more modes cannot pay
 
 
 def sampled_terms(terms: StiffnessTerms) -> StiffnessTerms:
@@ -284,8 +284,6 @@ def fit_in_best_modes(
 ) -> tuple[dict[str, Tensor], tuple[Tensor, Tensor], Tensor]:  # fmt: skip
     """Fit the maps at all cells and at half as many, then in more modes, as long as that is better.
 
-    More modes are not tried where most of the error is inside them, which grows with their number.
-
     `terms` are those of the body whose law is sampled. The samples are those to fit to, and those
     to choose by. `rank`, `cells` and `stages` are the largest numbers of modes, of sample cells,
     and of maps after the first.
@@ -334,10 +332,7 @@ def fit_in_best_modes(
     while cells > 1 and (other := fit(counts[0], cells // 2))[0] < best[0]:
         best, cells = other, cells // 2
     for count in counts[1:]:
-        if best[3] > INSIDE:
-            break
-        other = fit(count, cells)
-        if not other[0] < best[0]:
+        if best[3] > INSIDE or not (other := fit(count, cells))[0] < best[0]:
             break
         best = other
     predicted = both[0].displacement[:STEPPED] - scatter_fields(best[2], free)

@@ -105,7 +105,7 @@ def fit_gains(
     It is found as the maps are, with a prior of zero and ridges of `GAIN_RIDGES`, and maps
     coordinates of one parity, (R,), to such coordinates.
     """
-    gains, left_out = steps.new_zeros(len(parity), len(parity)), torch.empty_like(targets)
+    gains, left_out = steps.new_zeros(2 * parity.shape), torch.empty_like(targets)
     weights = weights[:, None]
     masks = [parity == p for p in parity.unique()]
     blocks = [_decomposed(weights * steps[:, own], weights * targets[:, own]) for own in masks]
