@@ -60,11 +60,10 @@ def choose_newton(
 ) -> tuple[SubspaceNewton, Tensor]:  # fmt: skip
     """Return Newton's method in the number of modes that suits the loads best.
 
-    More modes are taken, and at last more cells, where one step then leaves a mean error below
-    `WORTH` times the other on samples whose predictions do not know them; more than 100 only
+    More modes are taken, or more cells, where one step then leaves a mean error below `WORTH`
+    times the other on samples whose predictions do not know them; more than 100 modes only
     where `MAX_STEPS` steps leave a held-out error above `SUFFICIENT`. There modes that lower the
-    largest one are taken, too. The relative errors (S,) of the held-out loads after `MAX_STEPS`
-    steps are returned, too.
+    largest one are taken. The relative errors (S,) of the held-out loads are returned, too.
 
     Args:
         problem: The body.
@@ -96,11 +95,11 @@ def choose_newton(
     for rank in ranks[1:]:
         if rank > RANKS[1] and left.max() < SUFFICIENT:
             break
-        found, own = solver(rank, coarse)
-        if own < WORTH * error:
+        (found, own), before = solver(rank, coarse), float(left.max())
+        if own < WORTH * error or (before >= SUFFICIENT and errors(found).max() < before):
             best, error, left = found, own, errors(found)
-        elif left.max() >= SUFFICIENT and (other := errors(found)).max() < left.max():
-            best, error, left = found, own, other
+    if best.vectors.shape[2] == RANKS[1]:  # a step takes as long as in 60 modes with more cells
+        return best, left
     finer, own = solver(best.vectors.shape[2], fine)
     return (finer, errors(finer)) if own < WORTH * error else (best, left)
 
@@ -110,13 +109,16 @@ def with_gains(
 ) -> tuple[SubspaceNewton, float]:
     """Return a solver with gains for predictions (S, N, D) of the first samples, and its error.
 
-    It is the weighted mean after one step, by gains that are fitted to the other samples.
+    The gains map the first step to what `MAX_STEPS` steps leave. The error is the weighted mean
+    after one step, by gains that are fitted to the other samples.
     """
-    moved, basis = _corrected(solver, samples, guesses, 1), solver.vectors.flatten(0, 1)
-    truth = samples.displacement[: len(guesses)]
-    steps, rest = (moved - guesses).flatten(1) @ basis, (truth - moved).flatten(1)
+    truth, basis = samples.displacement[: len(guesses)], solver.vectors.flatten(0, 1)
+    moved = _corrected(solver, samples, guesses, 1)
+    last = _corrected(solver, samples, moved, MAX_STEPS - 1)
+    steps, rest = (moved - guesses).flatten(1) @ basis, (truth - last).flatten(1)
     weights, inside = sample_weights(truth.flatten(1)), rest @ basis
     gains, left = fit_gains(steps, inside, weights, parity)
+    left = left + (last - moved).flatten(1) @ basis
     outside = rest.square().sum(dim=1) - inside.square().sum(dim=1)
     error = weights * (left.square().sum(dim=1) + outside).clamp(min=0).sqrt()
     return replace(solver, gains=gains), float(error.mean())
