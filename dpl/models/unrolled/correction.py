@@ -15,7 +15,7 @@ RANKS = (60, 100, 160)  # numbers of modes that are tried, and all modes
 CANDIDATES = 600  # cells to choose from
 STATES = 64  # equilibria at which cells are chosen
 TOLERANCES = (3e-2, 3e-3)  # of the reduced forces of these cells, coarse and fine [-]
-WORTH = 0.75  # ratio of errors after one step below which more modes or cells are worth their time
+WORTH = 0.8  # ratio of errors after one step below which more modes or cells are worth their time
 MAX_STEPS = 6  # also of the simulator
 LOADS = 50  # held-out loads whose errors after all steps are measured
 SUFFICIENT = 2e-3  # largest relative error of these loads that needs no further modes [-]
@@ -60,10 +60,10 @@ def choose_newton(
 ) -> tuple[SubspaceNewton, Tensor]:  # fmt: skip
     """Return Newton's method in the number of modes that suits the loads best.
 
-    More modes are taken, or more cells, where one step then leaves a mean error below `WORTH`
-    times the other on samples whose predictions do not know them; more than 100 modes only
-    where `MAX_STEPS` steps leave a held-out error above `SUFFICIENT`. There modes that lower the
-    largest one are taken. The relative errors (S,) of the held-out loads are returned, too.
+    More modes are taken, or more cells, where one step then leaves a mean error of held-out loads
+    below `WORTH` times the other; more than 100 modes only where `MAX_STEPS` steps leave an error
+    above `SUFFICIENT`. There modes that lower the largest error are taken. The relative errors (S,)
+    of the held-out loads after `MAX_STEPS` steps are returned, too.
 
     Args:
         problem: The body.
@@ -79,49 +79,45 @@ def choose_newton(
     few = Sample(*(column[:LOADS] for column in held_out))
     vectors, parity = orthonormal_fields(modes[0], problem.free), modes[1]
 
-    def solver(rank: int, tolerance: float) -> tuple[SubspaceNewton, float]:
-        found = SubspaceNewton.within(
+    def solver(rank: int, tolerance: float) -> SubspaceNewton:
+        return SubspaceNewton.within(
             problem, vectors[..., :rank], some, tolerance=tolerance, candidates=candidates
         )
-        return with_gains(found, parity[:rank], samples, predicted)
 
-    def errors(found: SubspaceNewton) -> Tensor:
-        return relative_errors(few, _corrected(found, few, guesses[:LOADS], MAX_STEPS))
+    def errors(found: SubspaceNewton, steps: int) -> Tensor:
+        return relative_errors(few, _corrected(found, few, guesses[:LOADS], steps))
 
     coarse, fine = TOLERANCES
     ranks = [*(rank for rank in RANKS if rank < vectors.shape[2]), vectors.shape[2]]
-    best, error = solver(ranks[0], coarse)
-    left = errors(best)
+    best = solver(ranks[0], coarse)
+    error, most = (errors(best, steps) for steps in (1, MAX_STEPS))
     for rank in ranks[1:]:
-        if rank > RANKS[1] and left.max() < SUFFICIENT:
+        if rank > RANKS[1] and most.max() < SUFFICIENT:
             break
-        (found, own), before = solver(rank, coarse), float(left.max())
-        if own < WORTH * error or (before >= SUFFICIENT and errors(found).max() < before):
-            best, error, left = found, own, errors(found)
-    if best.vectors.shape[2] == RANKS[1]:  # a step takes as long as in 60 modes with more cells
-        return best, left
-    finer, own = solver(best.vectors.shape[2], fine)
-    return (finer, errors(finer)) if own < WORTH * error else (best, left)
+        found = solver(rank, coarse)
+        own, left = (errors(found, steps) for steps in (1, MAX_STEPS))
+        falls = most.max() >= SUFFICIENT and left.max() < most.max()
+        if falls or own.mean() < WORTH * error.mean():
+            best, error, most = found, own, left
+    if best.vectors.shape[2] != RANKS[1]:  # with more cells a step takes as long as in 100 modes
+        finer = solver(best.vectors.shape[2], fine)
+        best = finer if errors(finer, 1).mean() < WORTH * error.mean() else best
+    best = with_gains(best, parity[: best.vectors.shape[2]], samples, predicted)
+    return best, errors(best, MAX_STEPS)
 
 
 def with_gains(
     solver: SubspaceNewton, parity: Tensor, samples: Sample, guesses: Tensor
-) -> tuple[SubspaceNewton, float]:
-    """Return a solver with gains for predictions (S, N, D) of the first samples, and its error.
+) -> SubspaceNewton:
+    """Return a solver with gains for predictions (S, N, D) of the first samples.
 
-    The gains map the first step to what `MAX_STEPS` steps leave. The error is the weighted mean
-    after one step, by gains that are fitted to the other samples.
+    They map the first step to the errors in the modes that `MAX_STEPS` steps leave.
     """
     truth, basis = samples.displacement[: len(guesses)], solver.vectors.flatten(0, 1)
-    moved = _corrected(solver, samples, guesses, 1)
-    last = _corrected(solver, samples, moved, MAX_STEPS - 1)
-    steps, rest = (moved - guesses).flatten(1) @ basis, (truth - last).flatten(1)
-    weights, inside = sample_weights(truth.flatten(1)), rest @ basis
-    gains, left = fit_gains(steps, inside, weights, parity)
-    left = left + (last - moved).flatten(1) @ basis
-    outside = rest.square().sum(dim=1) - inside.square().sum(dim=1)
-    error = weights * (left.square().sum(dim=1) + outside).clamp(min=0).sqrt()
-    return replace(solver, gains=gains), float(error.mean())
+    first, last = (_corrected(solver, samples, guesses, steps) for steps in (1, MAX_STEPS))
+    steps, rest = (first - guesses).flatten(1) @ basis, (truth - last).flatten(1) @ basis
+    gains = fit_gains(steps, rest, sample_weights(truth.flatten(1)), parity)
+    return replace(solver, gains=gains)
 
 
 def _corrected(solver: SubspaceNewton, samples: Sample, guesses: Tensor, steps: int) -> Tensor:

@@ -97,23 +97,19 @@ def fit_map(
     return matrix, torch.where(weights > 0, left_out, targets - features @ matrix)
 
 
-def fit_gains(
-    steps: Tensor, targets: Tensor, weights: Tensor, parity: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return M (R, R) from steps s to targets M s, (S, R) both, and left-out errors (S, R).
+def fit_gains(steps: Tensor, targets: Tensor, weights: Tensor, parity: Tensor) -> Tensor:
+    """Return M (R, R) from steps s to targets M s, (S, R) both.
 
     It is found as the maps are, with a prior of zero and ridges of `GAIN_RIDGES`, and maps
     coordinates of one parity, (R,), to such coordinates.
     """
-    gains, left_out = steps.new_zeros(2 * parity.shape), torch.empty_like(targets)
-    weights = weights[:, None]
+    gains, weights = steps.new_zeros(2 * parity.shape), weights[:, None]
     masks = [parity == p for p in parity.unique()]
     blocks = [_decomposed(weights * steps[:, own], weights * targets[:, own]) for own in masks]
     ridge = _best_ridge(blocks, GAIN_RIDGES, 1)
     for own, block in zip(masks, blocks, strict=True):
         gains[own[:, None] & own] = (block.basis @ _solved(block, ridge)[0]).T.flatten()
-        left_out[:, own] = _left_out(block, ridge, 1, len(steps))[0]
-    return gains, left_out / weights.clamp(min=torch.finfo(torch.float64).tiny)
+    return gains
 
 
 class _Decomposed(NamedTuple):
