@@ -21,7 +21,7 @@ from dpl.fem.solvers.solution import Load, Solution, check_tol, evaluate_solutio
 
 MIN_DAMPING = 2.0**-4  # smallest damping factor [-]
 MIN_DETF_RATIO = 0.2  # a step must leave this part of min det F [-]
-MAX_SHIFT = 1e-3  # distance from the minimum of the energy to which steps converge, over ||u|| [-]
+MAX_SHIFT = 1e-4  # distance from the minimum of the energy to which steps converge, over ||u|| [-]
 LEAST_EIGENVALUE = 1e-2  # of an indefinite reduced tangent relative to that at rest [-]
 
 _Correction = tuple[Array, Callable[[Array], Array], Array]  # in W; from a residual; its shift
