@@ -222,6 +222,18 @@ def test_estimates_are_those_of_the_error_in_the_subspace(solver, unseen, truth,
         assert states[-1].error < 3e-6
 
 
+def test_gains_move_the_limit_by_a_part_of_the_first_correction(solver, vectors, unseen):
+    """At most by 1e-4 of the displacement."""
+    limit = solve_from(solver, unseen, torch.zeros_like(unseen.force))
+    gained = replace(solver, cubature=None, gains=0.2 * torch.eye(12).double())
+    near, far = (astray(vectors, limit, size) for size in (1e-4, 0.05))
+    moved = solve_from(gained, unseen, near) - limit
+    expected = 0.2 * (limit - near)
+    assert ((moved - expected).flatten(1).norm(dim=1) < 0.1 * expected.flatten(1).norm(dim=1)).all()
+    sizes = errors(solve_from(gained, unseen, far), limit)
+    assert sizes.tolist() == pytest.approx([1e-4] * 6, rel=0.2)
+
+
 def test_steps_end_at_the_estimated_error(newton, solver, vectors, unseen, truth):
     loose = fem.SubspaceNewton(newton.problem, vectors, solver.cubature, error_tol=1e-2)
     limit = solve_from(solver, unseen, truth)

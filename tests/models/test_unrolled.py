@@ -35,7 +35,7 @@ from dpl.models import Unrolled
 from dpl.models.unrolled.correction import choose_newton, fit_errors
 from dpl.models.unrolled.features import unbalanced_stress
 from dpl.models.unrolled.fit import choose_cells, modes_of_parity
-from dpl.models.unrolled.regression import RIDGES, MapParities, fit_map
+from dpl.models.unrolled.regression import RIDGES, MapParities, fit_gains, fit_map
 from dpl.scene import Scene
 from dpl.training import MSE, Surrogate
 from tests.laws import ISOTROPIC, LAWS
@@ -365,10 +365,22 @@ def test_the_fit_includes_newton_in_the_modes(beam, net):
 
 def test_newton_estimates_errors_also_where_it_improves_nothing(beam, net):
     samples = samples_of(beam, 8, seed=1)
-    modes, exact = net.correction().vectors, samples.displacement
-    solver, _ = choose_newton(beam.problem, modes, exact, samples, exact)
+    modes, exact = net.newton_modes.double(), samples.displacement
+    parity = torch.zeros(modes.shape[1])
+    solver, _ = choose_newton(beam.problem, (modes, parity), samples, exact, samples, exact)
     for load, u in zip(samples.load.unbatch(), exact, strict=True):
         assert next(solver.states(load, guess=u[None])).error < 1e-6
+
+
+def test_gains_are_the_matrix_of_linear_targets_and_keep_parities():
+    random = torch.Generator().manual_seed(0)
+    steps, matrix = (torch.randn(n, 5, generator=random).double() for n in (40, 5))
+    parity = torch.tensor([0, 1, 0, 3, 1])
+    matrix *= parity[:, None] == parity
+    targets, weights = steps @ matrix.T, torch.rand(40, generator=random).double() + 0.1
+    gains = fit_gains(steps, targets, weights, parity)
+    assert gains == pytest.approx(matrix, abs=1e-4)
+    assert not fit_gains(steps, torch.zeros(40, 5).double(), weights, parity).any()
 
 
 def test_a_surrogate_is_fitted_without_a_trainer(beam, tmp_path):
@@ -388,6 +400,17 @@ def calibrated(beam):
     net = Unrolled(beam, **{**SMALL, "cells": 16})
     net.fit(samples_of(beam, 80), samples_of(beam, 40, seed=1))
     return net
+
+
+def test_gains_lower_the_errors_that_a_step_leaves(beam, calibrated):
+    unseen, solver = samples_of(beam, 30, seed=12), calibrated.correction()
+
+    def left(gains):
+        steps = replace(solver, gains=gains, error_tol=1e-9, max_iter=1)
+        *_, last = steps.iterate(unseen.load, guess=calibrated(unseen.force))
+        return (last.displacement - unseen.displacement).flatten(1).norm(dim=1).mean()
+
+    assert left(calibrated.newton_gains) < 0.95 * left(None)
 
 
 def test_errors_are_estimated_within_a_factor_and_never_far_below(beam, calibrated):

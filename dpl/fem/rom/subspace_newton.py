@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
-from scipy.linalg import lapack
+from scipy.linalg import lapack, solve_triangular
 from scipy.linalg.blas import dnrm2  # without under- or overflow of squares
 from torch import Tensor
 
@@ -21,9 +21,10 @@ from dpl.fem.solvers.solution import Load, Solution, check_tol, evaluate_solutio
 
 MIN_DAMPING = 2.0**-4  # smallest damping factor [-]
 MIN_DETF_RATIO = 0.2  # a step must leave this part of min det F [-]
+MAX_SHIFT = 1e-4  # distance from the minimum of the energy to which steps converge, over ||u|| [-]
 LEAST_EIGENVALUE = 1e-2  # of an indefinite reduced tangent relative to that at rest [-]
 
-_Correction = tuple[Array, Callable[[Array], Array]]  # coordinates in W, (R,); inverse tangent
+_Correction = tuple[Array, Callable[[Array], Array], Array]  # in W; from a residual; its shift
 
 
 class SubspaceState(NamedTuple):
@@ -57,7 +58,9 @@ class SubspaceNewton:
 
     The error in the Euclidean norm is not bounded by this. Steps converge to the minimum of the
     energy within the subspace, and stiff errors outside the subspace cause soft ones in it. Choose
-    the number of modes such that held-out loads improve.
+    the number of modes such that held-out loads improve. With `gains` M, fitted to guesses of one
+    kind, each correction is increased by M s_0, where s_0 is the first one, so that the steps
+    converge to this distance from the minimum. M s_0 is limited to `MAX_SHIFT` times ||u||.
 
     Source: Deuflhard (2011), Newton Methods for Nonlinear Problems, section 3.3 (error-oriented
     descent; algorithm NLEQ-ERR); Nocedal, Wright (2006), Numerical Optimization, section 3.4
@@ -72,6 +75,7 @@ class SubspaceNewton:
         error_tol: Estimated relative error within the subspace at which the steps end [-]. Products
             with V in float32 resolve errors down to about 1e-7.
         max_iter: Largest number of steps.
+        gains: M, (R, R) [-]; None: zero.
 
     Raises:
         ValueError: At the first load, if the body has rigid body modes.
@@ -83,6 +87,7 @@ class SubspaceNewton:
     tol: float = 1e-8
     error_tol: float = option("", default=2e-5, above=0, most=1)
     max_iter: int = option("", default=4, least=0)
+    gains: Tensor | None = None
 
     @classmethod
     def within(
@@ -179,9 +184,9 @@ class SubspaceNewton:
         yield state
         best = state
         while correction is not None and not is_last(state):
-            following = self._step(problem, load, state, correction, is_over)
+            following, shift = self._step(problem, load, state, correction, is_over), correction[2]
             if following is None and self.cubature is not None and not is_over():
-                correction = self._correction(problem, load, state, whole=True)
+                correction = self._correction(problem, load, state, shift, whole=True)
                 if correction is not None:
                     following = self._step(problem, load, state, correction, is_over)
             if following is None:
@@ -190,13 +195,14 @@ class SubspaceNewton:
             best = state if state.error < best.error else best
             if is_last(state) or is_over():
                 break
-            correction = self._correction(problem, load, state)
+            correction = self._correction(problem, load, state, shift)
         if best is not state:
             yield best._replace(iterations=state.iterations)
 
     def _correction(
-        self, problem: Problem, load: Load, state: SubspaceState, *, whole: bool = False
-    ) -> _Correction | None:
+        self, problem: Problem, load: Load, state: SubspaceState, shift: Array | None = None,
+        *, whole: bool = False,
+    ) -> _Correction | None:  # fmt: skip
         """Return Newton's correction, None where an element is inverted; `whole`: of all cells."""
         if not state.evaluation.volume_ratio > 0:
             return None
@@ -204,7 +210,18 @@ class SubspaceNewton:
         tangent = self.tangent.at(problem, state.displacement[0], whole=whole)
         solve = _factorised(tangent)
         y = solve(right)
-        return (y, solve) if np.isfinite(y).all() else None
+        if not np.isfinite(y).all():
+            return None
+        added = self._shift(y, state.displacement) if shift is None else shift
+        return y + added, lambda right: solve(right) + added, added
+
+    def _shift(self, y: Array, displacement: Tensor) -> Array:
+        """Return M s_0 in coordinates of W, (R,), of the first correction (R,)."""
+        if self.gains is None:
+            return np.zeros_like(y)
+        scale = self.tangent.scale
+        shift: Array = solve_triangular(scale, self.gains.numpy() @ (scale @ y))
+        return shift * min(1.0, MAX_SHIFT / max(self._relative(shift, displacement), 1e-300))
 
     def _step(
         self,
@@ -215,7 +232,7 @@ class SubspaceNewton:
         is_over: Callable[[], bool],
     ) -> SubspaceState | None:
         """Return the state after the longest acceptable step, None if none was found in time."""
-        full, solve = correction
+        full, solve, _ = correction
         product = torch.from_numpy(_scaled_product(self.tangent.rows, full))
         size, update = self._norm(full), product.view(self.problem.shape)
         lowest = MIN_DETF_RATIO * min(float(state.evaluation.volume_ratio), 1.0)

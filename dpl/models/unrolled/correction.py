@@ -1,19 +1,24 @@
 """Newton's method that follows a fitted reduced model, and the errors of both on held-out loads."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from dpl.fem import Problem, SubspaceNewton
+from dpl.fem.rom.pod import orthonormal_fields
+from dpl.models.unrolled.fit import sample_weights
+from dpl.models.unrolled.regression import fit_gains
 from dpl.scene import Sample
 
-RANKS = (60, 160)  # numbers of modes that are tried, and all modes
+RANKS = (60, 100, 160)  # numbers of modes that are tried, and all modes
 CANDIDATES = 600  # cells to choose from
 STATES = 64  # equilibria at which cells are chosen
 TOLERANCES = (3e-2, 3e-3)  # of the reduced forces of these cells, coarse and fine [-]
-WORTH = 0.8  # ratio of mean errors after one step below which the fine tolerance is worth its time
+WORTH = 0.8  # ratio of errors after one step below which more modes or cells are worth their time
 MAX_STEPS = 6  # also of the simulator
-LOADS = 50  # held-out loads by whose errors the number of modes is chosen
-SUFFICIENT = 2e-3  # largest relative error of these loads for which no more modes are tried [-]
+LOADS = 50  # held-out loads whose errors after all steps are measured
+SUFFICIENT = 2e-3  # largest relative error of these loads that needs no further modes [-]
 ERROR = 1e-5  # estimated relative error at which the steps end [-]
 RIDGE = 1.0  # of exponents, in squares of logarithms
 DEVIATIONS = 2.5  # standard deviations of fitted errors by which estimates exceed them
@@ -50,55 +55,75 @@ def fit_errors(sizes: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def choose_newton(
-    problem: Problem, modes: Tensor, states: Tensor, held_out: Sample, guesses: Tensor
-) -> tuple[SubspaceNewton, Tensor]:
-    """Return Newton's method in the number of modes that suits held-out loads best.
+    problem: Problem, modes: tuple[Tensor, Tensor], samples: Sample, predicted: Tensor,
+    held_out: Sample, guesses: Tensor,
+) -> tuple[SubspaceNewton, Tensor]:  # fmt: skip
+    """Return Newton's method in the number of modes that suits the loads best.
 
-    The fewest modes are taken with which `MAX_STEPS` steps bring every load below `SUFFICIENT`;
-    else those with the smallest largest error. More cells are chosen where one step then leaves a
-    mean error below `WORTH` times the other, as on bodies under a pressure, whose forces hide
-    those of soft modes. The relative errors (S,) of the held-out loads after `MAX_STEPS` steps are
-    returned, too.
+    More modes are taken, or more cells, where one step then leaves a mean error of held-out loads
+    below `WORTH` times the other; more than 100 modes only where `MAX_STEPS` steps leave an error
+    above `SUFFICIENT`. There modes that lower the largest error are taken. The relative errors (S,)
+    of the held-out loads after `MAX_STEPS` steps are returned, too.
 
     Args:
         problem: The body.
-        modes: V, orthonormal, the most important mode first, (N, D, R).
-        states: Equilibria at which cells are chosen, (S, N, D).
-        held_out, guesses: `LOADS` samples by whose errors the number is chosen, and predictions.
+        modes: V, the most important mode first, (n, R), and their parities, (R,).
+        samples: Samples; their solutions are states at which cells are chosen.
+        predicted: Predictions (S, N, D) of the first samples by maps that are fitted to the others.
+        held_out, guesses: Held-out samples and their predictions, (S, N, D).
     """
     random = torch.randperm(len(problem.cells), generator=torch.Generator().manual_seed(0))
     candidates = random[:CANDIDATES].sort().values
+    states = samples.displacement
     some = states[:: max(1, len(states) // STATES)][:STATES]
+    few = Sample(*(column[:LOADS] for column in held_out))
+    vectors, parity = orthonormal_fields(modes[0], problem.free), modes[1]
 
     def solver(rank: int, tolerance: float) -> SubspaceNewton:
         return SubspaceNewton.within(
-            problem, modes[..., :rank], some, tolerance=tolerance, candidates=candidates
+            problem, vectors[..., :rank], some, tolerance=tolerance, candidates=candidates
         )
 
     def errors(found: SubspaceNewton, steps: int) -> Tensor:
-        return relative_errors(held_out, _corrected(found, held_out, guesses, steps))
+        return relative_errors(few, _corrected(found, few, guesses[:LOADS], steps))
 
     coarse, fine = TOLERANCES
-    ranks = [*(rank for rank in RANKS if rank < modes.shape[2]), modes.shape[2]]
-    best: tuple[SubspaceNewton, Tensor] | None = None
-    for rank in ranks:
-        found = solver(rank, coarse)
-        left = errors(found, MAX_STEPS)
-        if best is None or left.max() < best[1].max():
-            best = found, left
-        if left.max() < SUFFICIENT:
+    ranks = [*(rank for rank in RANKS if rank < vectors.shape[2]), vectors.shape[2]]
+    best = solver(ranks[0], coarse)
+    error, most = (errors(best, steps) for steps in (1, MAX_STEPS))
+    for rank in ranks[1:]:
+        if rank > RANKS[1] and most.max() < SUFFICIENT:
             break
-    assert best is not None
-    finer = solver(best[0].vectors.shape[2], fine)
-    if errors(finer, 1).mean() < WORTH * errors(best[0], 1).mean():
-        return finer, errors(finer, MAX_STEPS)
-    return best
+        found = solver(rank, coarse)
+        own, left = (errors(found, steps) for steps in (1, MAX_STEPS))
+        falls = most.max() >= SUFFICIENT and left.max() < most.max()
+        if falls or own.mean() < WORTH * error.mean():
+            best, error, most = found, own, left
+    if best.vectors.shape[2] != RANKS[1]:  # with more cells a step takes as long as in 100 modes
+        finer = solver(best.vectors.shape[2], fine)
+        best = finer if errors(finer, 1).mean() < WORTH * error.mean() else best
+    best = with_gains(best, parity[: best.vectors.shape[2]], samples, predicted)
+    return best, errors(best, MAX_STEPS)
+
+
+def with_gains(
+    solver: SubspaceNewton, parity: Tensor, samples: Sample, guesses: Tensor
+) -> SubspaceNewton:
+    """Return a solver with gains for predictions (S, N, D) of the first samples.
+
+    They map the first step to the errors in the modes that `MAX_STEPS` steps leave.
+    """
+    truth, basis = samples.displacement[: len(guesses)], solver.vectors.flatten(0, 1)
+    first, last = (_corrected(solver, samples, guesses, steps) for steps in (1, MAX_STEPS))
+    steps, rest = (first - guesses).flatten(1) @ basis, (truth - last).flatten(1) @ basis
+    gains = fit_gains(steps, rest, sample_weights(truth.flatten(1)), parity)
+    return replace(solver, gains=gains)
 
 
 def _corrected(solver: SubspaceNewton, samples: Sample, guesses: Tensor, steps: int) -> Tensor:
-    """Return displacements (S, N, D) after at most so many steps from guesses (S, N, D)."""
+    """Return displacements (S, N, D) of the first samples after some steps from guesses."""
     found = []
-    for load, guess in zip(samples.load.unbatch(), guesses.split(1), strict=True):
+    for load, guess in zip(samples.load.unbatch(), guesses.split(1), strict=False):
         *_, last = solver.states(load, guess=guess, max_iter=steps, error_tol=ERROR)
         found.append(last.displacement)
     return torch.cat(found)

@@ -25,8 +25,10 @@ MAX_ROWS = 2**14  # samples and images to which maps are fitted
 MAX_BYTES = 2**31  # of snapshots and images from which modes are computed, in float32
 MIN_RANK = 40  # modes; fewer are not tried
 NOISE = 5e-7  # singular value over the largest below which a mode is rounding error
+STEPPED = 256  # samples to which the gains of a step are fitted
 LIMIT = 1.5  # factor on the largest ratio of corrections in the samples
 MIN_GAIN = 0.97  # largest ratio of held-out errors for which another map is worth its time
+INSIDE = 0.8  # part of held-out errors inside the modes above which more modes cannot pay
 
 
 def sampled_terms(terms: StiffnessTerms) -> StiffnessTerms:
@@ -175,15 +177,15 @@ def maps_at_cells(
     *,
     copies: int,
     stages: int,
-) -> tuple[Maps, Tensor]:
+) -> tuple[Maps, list[Tensor]]:
     """Fit maps one after the other, as long as the held-out error decreases enough.
 
     A map that is fitted to few samples predicts them better than others. The next map is therefore
     fitted to states of each sample that follow from maps which are fitted to the other samples.
 
     Returns:
-        The maps, and what they miss of the held-out targets, (S, R). The first map is zero if none
-        is good enough.
+        The maps, and what they miss of the targets of both sets, (S, R) each: of the first set by
+        maps that are fitted to the other samples. The first map is zero if none is good enough.
     """
     (fitted, held), (count, dim, _) = sets, cells.gradients.shape[1:]
     matrices, limits = list[Tensor](), list[Tensor]()
@@ -210,7 +212,8 @@ def maps_at_cells(
     if not matrices:
         matrices = [torch.zeros(count * dim * dim, fitted.linear.shape[1], dtype=torch.float64)]
         limits = [torch.tensor(1.0, dtype=torch.float64)]
-    return Maps(cells, matrices, torch.stack(limits)), held.target - present[1]
+    missed = [part.target - c for part, c in zip(sets, present, strict=True)]
+    return Maps(cells, matrices, torch.stack(limits)), missed
 
 
 def _features(law: Material, cells: SampleCells, samples: Columns, c: Tensor | None) -> Tensor:
@@ -236,8 +239,8 @@ def fit_maps(
     copies: int,
     cells: int,
     stages: int,
-) -> tuple[dict[str, Tensor], Tensor]:
-    """Return buffers of the maps at sample cells, and what they miss of held-out targets, (S, R).
+) -> tuple[dict[str, Tensor], list[Tensor]]:
+    """Return buffers of the maps at sample cells, and what they miss, see `maps_at_cells`.
 
     Args:
         linear: Linear solutions of the body.
@@ -278,7 +281,7 @@ def fit_maps(
 def fit_in_best_modes(
     linear: LinearResponse, terms: StiffnessTerms, both: tuple[Sample, Sample], *, rank: int,
     cells: int, stages: int,
-) -> tuple[dict[str, Tensor], Tensor]:  # fmt: skip
+) -> tuple[dict[str, Tensor], tuple[Tensor, Tensor], Tensor]:  # fmt: skip
     """Fit the maps at all cells and at half as many, then in more modes, as long as that is better.
 
     `terms` are those of the body whose law is sampled. The samples are those to fit to, and those
@@ -287,7 +290,8 @@ def fit_in_best_modes(
 
     Returns:
         The buffers of `dpl.models.Unrolled`, by name, of the fit with the smallest weighted mean
-        error of held-out samples; and all modes, (n, R).
+        error of held-out samples; all modes, (n, R), and their parities, (R,); and predictions
+        (S, N, D) of the first `STEPPED` samples by maps that are fitted to the other samples.
     """
     free = linear.scene.problem.free
     rests = [
@@ -301,7 +305,7 @@ def fit_in_best_modes(
     turned = [_image(every.T, one, free).T for one in few]
     factors = terms.factors(terms.problem.reference.material)
 
-    def fit(count: int, cells: int) -> tuple[float, dict[str, Tensor]]:
+    def fit(count: int, cells: int) -> tuple[float, dict[str, Tensor], Tensor, float]:
         modes = every[:, :count]
         stiffness = ReducedStiffness(reduced_terms(terms, modes), terms)
         # coordinates of images of the samples are those of the samples in images of the modes
@@ -313,9 +317,13 @@ def fit_in_best_modes(
         in_modes, sets = (modes, parity[:count], inverse), (fitted, held)
         found, missed = fit_maps(linear, terms.problem, in_modes, sets, **options)
         outside = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)
-        square = missed.square().sum(dim=1) + outside.clamp(min=0)
+        inside = missed[1].square().sum(dim=1)
+        squares = inside, inside + outside.clamp(min=0)
+        inner, error = (float((square.sqrt() * held.weights).mean()) for square in squares)
         own = {"modes": modes.float(), "parity": parity[:count], "stiffness": stiffness.parts}
-        return float((square.sqrt() * held.weights).mean()), own | found
+        few = slice(min(STEPPED, len(rests[0])))  # the samples without their images
+        left_out = rests[0][few] + (missed[0] - fitted.target)[few] @ modes.T
+        return error, own | found, left_out, inner / max(error, 1e-300)
 
     counts = [every.shape[1]]
     while counts[0] // 2 >= MIN_RANK:
@@ -324,8 +332,8 @@ def fit_in_best_modes(
     while cells > 1 and (other := fit(counts[0], cells // 2))[0] < best[0]:
         best, cells = other, cells // 2
     for count in counts[1:]:
-        other = fit(count, cells)
-        if not other[0] < best[0]:
+        if best[3] > INSIDE or not (other := fit(count, cells))[0] < best[0]:
             break
         best = other
-    return best[1], every
+    predicted = both[0].displacement[:STEPPED] - scatter_fields(best[2], free)
+    return best[1], (every, parity), predicted

@@ -20,7 +20,7 @@ from dpl.models.interface import StoredBuffers, check_indices
 from dpl.models.linear_base import SCALE_STREAM
 from dpl.models.linear_response import Array, LinearResponse, OrbitArrays, Solve, largest
 from dpl.models.unrolled.compiled import LawArguments, law_arguments, model_arrays
-from dpl.models.unrolled.correction import LOADS, choose_newton, fit_errors, relative_errors
+from dpl.models.unrolled.correction import choose_newton, fit_errors, relative_errors
 from dpl.models.unrolled.fit import fit_in_best_modes, sampled_terms
 from dpl.models.unrolled.loops import ModelArrays, predict
 from dpl.models.unrolled.products import Tensors, in_rows, nonlinear_coordinates
@@ -86,8 +86,8 @@ class Unrolled(StoredBuffers):
         limits: Largest ratio of each correction to the one before, (1 + K,): 1.5 times that of the
             samples. They keep loads far out of range from running away.
         newton_modes: Modes of Newton's method that follows, (n, K).
-        newton_cells: Cells of its tangent, (C,).
-        newton_weights: Their weights, (C,).
+        newton_cells, newton_weights: Cells of its tangent, and their weights, (C,) each.
+        newton_gains: Gains of its steps, (K, K), see `SubspaceNewton`.
         error_factors, error_exponents: Estimated errors of the prediction, and of what Newton's
             method leaves, by the sizes of the corrections, (2,) and (2, K + 2), see `fit_errors`;
             the factors are logarithms.
@@ -108,6 +108,7 @@ class Unrolled(StoredBuffers):
     newton_modes: Tensor
     newton_cells: Tensor
     newton_weights: Tensor
+    newton_gains: Tensor
     error_factors: Tensor
     error_exponents: Tensor
     least_sizes: Tensor
@@ -167,6 +168,7 @@ class Unrolled(StoredBuffers):
             "newton_modes": ((free, newton_modes), torch.float32),
             "newton_cells": ((newton,), torch.int64),
             "newton_weights": ((newton,), torch.float64),
+            "newton_gains": ((newton_modes, newton_modes), torch.float64),
             "error_factors": ((2,), torch.float64),
             "error_exponents": ((2, 2 + maps), torch.float64),
             "least_sizes": ((2 + maps,), torch.float64),
@@ -328,19 +330,17 @@ class Unrolled(StoredBuffers):
         """
         options = {"rank": self.rank, "cells": self.sample_count, "stages": self.stages}
         dead = self._of_dead_loads(samples), self._of_dead_loads(held_out)
-        best, every = fit_in_best_modes(self.linear, self.terms, dead, **options)
+        best, modes, unseen = fit_in_best_modes(self.linear, self.terms, dead, **options)
         for name, buffer in best.items():
             setattr(self, name, buffer)
         self._prepare()
         self.fitted = torch.tensor(True)
         guesses, sizes = self._fields(held_out.force, held_out.parameters)
-        few = Sample(*(column[:LOADS] for column in held_out))
-        problem, states = self.scene.problem, samples.displacement
-        vectors = orthonormal_fields(every, problem.free)
-        found, left = choose_newton(problem, vectors, states, few, guesses[:LOADS])
-        self.newton_modes = every[:, : found.vectors.shape[2]].float()
-        assert found.cubature is not None  # cells are always chosen
+        found, left = choose_newton(self.scene.problem, modes, samples, unseen, held_out, guesses)
+        assert found.cubature is not None  # cells and gains are always chosen
+        self.newton_modes = modes[0][:, : found.vectors.shape[2]].float()
         self.newton_cells, self.newton_weights = found.cubature.cells, found.cubature.weights
+        self.newton_gains = cast("Tensor", found.gains)
         both = (sizes, relative_errors(held_out, guesses)), (sizes[: len(left)], left)
         columns = zip(*(fit_errors(*pair) for pair in both), strict=True)
         self.error_factors, self.error_exponents = map(torch.stack, columns)
@@ -358,7 +358,7 @@ class Unrolled(StoredBuffers):
         self._doubt  # noqa: B018  # computed here, so that the first prediction is not slower
         vectors = orthonormal_fields(self.newton_modes, self.scene.problem.free)
         cells = Cubature(self.newton_cells, self.newton_weights, 0.0)
-        return SubspaceNewton(self.scene.problem, vectors, cells)
+        return SubspaceNewton(self.scene.problem, vectors, cells, gains=self.newton_gains)
 
     def skipped_work(self) -> list[str]:
         """Return the work that the model saves, one line each."""

@@ -1,5 +1,6 @@
 """Ridge regression of the maps of `dpl.models.Unrolled`, which keep parities."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -8,6 +9,7 @@ from torch import Tensor
 from dpl.fem.parity import Parities, SignedOrbits
 
 RIDGES = tuple(10.0**-k for k in range(16, 2, -1))  # relative to the mean square [-]
+GAIN_RIDGES = tuple(10.0**k for k in range(-6, 3))  # the same, of gains of a step
 ROUNDING = 1e-10  # norm of a feature over the largest below which it is rounding error
 LEAST = 1e-12  # part of a row that the other rows never predict [-]
 CHOOSING = 256  # samples whose left-out errors choose the ridge
@@ -79,22 +81,35 @@ def fit_map(
     rest = targets - features @ prior
     if not (features.isfinite().all() and rest.isfinite().all()):
         raise ValueError("the samples are not finite")
-    squares, blocks, shifts = torch.zeros(1), [], rest.new_tensor(RIDGES)
+    blocks = []
     for p, characters in enumerate(symmetry.parities.characters):
         own = symmetry.coordinates == p
         X = weights * orbits.coordinates(features, characters)
         block = _decomposed(X, weights * rest[:, own])
         blocks.append((own, characters, block))
-        errors = _left_out(block, shifts, images, CHOOSING)
-        squares = squares + errors.square().sum(dim=2)
-    chosen = squares.sqrt().mean(dim=1).argmin()[None]
+    ridge = _best_ridge([block for *_, block in blocks], RIDGES, images)
     matrix, left_out = torch.zeros_like(prior), torch.empty_like(rest)
     for own, characters, block in blocks:
-        change = block.basis @ _solved(block, shifts[chosen])[0]
+        change = block.basis @ _solved(block, ridge)[0]
         matrix[:, own] = prior[:, own] + orbits.fields(change.T, characters, len(prior)).T
-        left_out[:, own] = _left_out(block, shifts[chosen], images, len(rest))[0]
+        left_out[:, own] = _left_out(block, ridge, images, len(rest))[0]
     left_out = left_out / weights.clamp(min=torch.finfo(torch.float64).tiny)
     return matrix, torch.where(weights > 0, left_out, targets - features @ matrix)
+
+
+def fit_gains(steps: Tensor, targets: Tensor, weights: Tensor, parity: Tensor) -> Tensor:
+    """Return M (R, R) from steps s to targets M s, (S, R) both.
+
+    It is found as the maps are, with a prior of zero and ridges of `GAIN_RIDGES`, and maps
+    coordinates of one parity, (R,), to such coordinates.
+    """
+    gains, weights = steps.new_zeros(2 * parity.shape), weights[:, None]
+    masks = [parity == p for p in parity.unique()]
+    blocks = [_decomposed(weights * steps[:, own], weights * targets[:, own]) for own in masks]
+    ridge = _best_ridge(blocks, GAIN_RIDGES, 1)
+    for own, block in zip(masks, blocks, strict=True):
+        gains[own[:, None] & own] = (block.basis @ _solved(block, ridge)[0]).T.flatten()
+    return gains
 
 
 class _Decomposed(NamedTuple):
@@ -122,6 +137,13 @@ def _decomposed(X: Tensor, Y: Tensor) -> _Decomposed:
     basis = factors[:, None] * (X.T @ Q if is_dual else Q)
     values = values.clamp(min=0) / max(X.shape[1], 1)
     return _Decomposed(values, Q if is_dual else X @ Q, basis, Y, is_dual)
+
+
+def _best_ridge(blocks: Sequence[_Decomposed], ridges: Sequence[float], images: int) -> Tensor:
+    """Return the ridge, (1,), with the smallest mean left-out error of all blocks."""
+    every = blocks[0].values.new_tensor(ridges)
+    squares = [_left_out(block, every, images, CHOOSING).square().sum(dim=2) for block in blocks]
+    return every[torch.stack(squares).sum(dim=0).sqrt().mean(dim=1).argmin()][None]
 
 
 def _solved(block: _Decomposed, ridges: Tensor) -> Tensor:
