@@ -663,7 +663,7 @@ struct Condensed {  // dpl.fem.linear.condensation; one matrix for each of M par
   std::size_t length = 0;              // V
   int most = 0;                        // largest length of the rows of a front
 
-  static std::int64_t wide(std::int64_t count) { return (count + 31) / 32 * 32; }  // length of rows, filled with zeros
+  static std::int64_t wide(std::int64_t count) { return (count + 15) / 16 * 16; }  // length of rows, filled with zeros
 
   template <class Number, class T>
   void solve(const Number* blocks, const T* of_inverse, T* force, T* solution, std::vector<T>& work) const {
