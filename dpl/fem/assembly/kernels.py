@@ -66,7 +66,8 @@ class Kernels:
         inverse = np.linalg.pinv(reference) @ dN
         if np.allclose(inverse, inverse[:, :1], rtol=0, atol=AFFINE * np.abs(inverse).max()):
             inverse = inverse[:, :1]
-        inverse[np.abs(inverse) < AFFINE * np.abs(inverse).max()] = 0.0
+        if same:  # the Jacobians of boxes are diagonal
+            inverse[np.abs(inverse) < AFFINE * np.abs(inverse).max()] = 0.0
         missing = 3 - dN.shape[-1]
         inverse = np.pad(inverse, [(0, 0), (0, 0), (0, missing), (0, missing)])
         self.cells = _in_blocks(cells).astype(np.uint32)
