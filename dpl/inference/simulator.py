@@ -29,7 +29,7 @@ from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import TrainedSurrogate
 
-ERROR = 1e-3  # estimated relative error in the modes at which the steps end [-]
+ERROR = 1e-3  # estimated relative error in the modes at which steps end, and are not begun [-]
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
 WORTH = 1 / 3  # known error after steps over that before, below which they are made [-]
 MAX_RESIDUAL = 1.0  # above it the error outside of the modes is not that of the training [-]
@@ -327,7 +327,8 @@ class Simulator:
             return first
         in_range = bool((first.state.volume_ratio > 0) & (first.state.residual < MAX_RESIDUAL))
         enough = request.sufficient_error if taken < self.steps else FAR
-        pays = guess.error_outside < WORTH * guess.error and not request.is_more_than_prediction
+        pays = ERROR < guess.error and guess.error_outside < WORTH * guess.error
+        pays &= not request.is_more_than_prediction
         if in_range and guess.error <= enough and not pays:
             return first._replace(error=guess.error)
         default = guess.error_outside if pays else ERROR
