@@ -327,7 +327,7 @@ class Simulator:
             return first
         in_range = bool((first.state.volume_ratio > 0) & (first.state.residual < MAX_RESIDUAL))
         enough = request.sufficient_error if taken < self.steps else FAR
-        pays = ERROR < guess.error and guess.error_outside < WORTH * guess.error
+        pays = guess.error > ERROR and guess.error_outside < WORTH * guess.error
         pays &= not request.is_more_than_prediction
         if in_range and guess.error <= enough and not pays:
             return first._replace(error=guess.error)
