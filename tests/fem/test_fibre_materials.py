@@ -214,6 +214,14 @@ def test_shortened_fibres_have_neither_stress_nor_stiffness(name):
     assert_close(law.tangent(H), law.matrix.tangent(H), rtol=0, atol=0)
 
 
+def test_a_nearly_incompressible_matrix_becomes_compressible_around_the_same_fibres(frames):
+    fibres = FIBRES["two_families"]
+    law = fem.FibreReinforced(fem.NeoHookeanIsoK2(0.49), fibres, frames)
+    found = law.compressible()
+    assert found.parts == {**law.parts, "matrix": law.parts["matrix"].compressible()}
+    assert float(found.parts["matrix"].poisson_ratio) == pytest.approx(0.0, abs=1e-12)
+
+
 def test_fibres_have_their_stiffness_at_rest():
     """Stretched fibres decide the moduli there, so that the linear solution resists."""
     zero = torch.zeros(3, 3, dtype=torch.float64)

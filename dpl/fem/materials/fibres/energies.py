@@ -7,7 +7,7 @@ order.
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -35,6 +35,10 @@ class FibreEnergy(Parametrised):
     def energy(self, e: Tensor) -> Tensor:
         """Return the energy density over E, (...,) [-], of e = C - I (..., 3, 3) [-]."""
         raise NotImplementedError
+
+    def compressible(self) -> Self:
+        """Return the energy itself; the matrix around fibres decides Poisson's ratio."""
+        return self
 
     @property
     def moduli_at_rest(self) -> tuple[Tensor, ...]:
