@@ -357,15 +357,9 @@ class Gripper:
         return patch
 
     def _reported(
-        self,
-        body: HeldBody,
-        load: Load,
-        held: Candidate,
-        request: Request,
-        frames: CorotatedFactor | None = None,
-        *,
-        is_one: bool,
-    ) -> GraspAnswer:
+        self, body: HeldBody, load: Load, held: Candidate, request: Request,
+        frames: CorotatedFactor | None = None, *, is_one: bool,
+    ) -> GraspAnswer:  # fmt: skip
         """Return a candidate as an answer in SI units."""
         scene, state = self.scene, held.state
         unit, dim = float(load.young) * scene.force_unit, scene.problem.shape[1]
