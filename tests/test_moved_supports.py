@@ -80,7 +80,7 @@ def test_linear_solutions_of_a_network_are_in_equilibrium(scene):
     assert keeps_supports(scene, linear)
     product = body.tangent_product(torch.zeros_like(linear), linear)
     residual = (product - load.force)[:, body.free].norm(dim=1)
-    assert (residual < 1e-5 * product.flatten(1).norm(dim=1)).all()
+    assert (residual < 1e-3 * product.flatten(1).norm(dim=1)).all()
 
 
 @pytest.mark.parametrize("request_of", [{"tol": 1e-3}, {"error": 1e-3}], ids=["tol", "error"])

@@ -178,7 +178,7 @@ def test_the_linear_base_of_a_network_is_the_linear_solution(name, scene, load):
     found = LinearResponse(scene).solutions(load)
     bodies = [fem.LinearSolver(own_body(name, one.parameters)) for one in load.unbatch()]
     expected = torch.stack([own.solve(f) for own, f in zip(bodies, load.force, strict=True)])
-    assert (found - expected).norm() < 1e-5 * expected.norm()
+    assert (found - expected).norm() < 5e-5 * expected.norm()
 
 
 def test_a_load_without_its_value_is_refused(name, scene, load):

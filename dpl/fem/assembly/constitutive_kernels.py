@@ -285,17 +285,11 @@ def differentiate(derivatives, i1, e, X, D):
 
 
 @inlined
-def along(P, directions, first, diagonal, out, at):
+def along(P, directions, first, out, at):
     """Set the rows 3 i + d of `out` from `at` to the sum over j of P_ij n_dj.
 
-    The directions n_dj are the rows 3 d + j of `directions` from `first`; `diagonal` says that they
-    are zero for d != j.
+    The directions n_dj are the rows 3 d + j of `directions` from `first`.
     """
-    if diagonal:
-        for i in range(3):
-            for d in range(3):
-                store(out, at + 3 * i + d, load(P, 3 * i + d) * load(directions, first + 4 * d))
-        return
     for i in range(3):
         p0, p1, p2 = load(P, 3 * i), load(P, 3 * i + 1), load(P, 3 * i + 2)
         for d in range(3):

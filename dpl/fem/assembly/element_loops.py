@@ -21,7 +21,6 @@ from dpl.fem.assembly.lanes import (
     gather_constants,
     gather_frame,
     gradient,
-    is_diagonal,
     keep_minimum,
     rows,
     scatter,
@@ -53,7 +52,7 @@ def add_projected(value, functions, out):
 
 @inlined
 def pressures_of_cells(
-    law, c, finite, G, inverse, diagonal, block, weights, functions, bulk, gap, j, out, low
+    law, c, finite, G, inverse, block, weights, functions, bulk, gap, j, out, low
 ):  # fmt: skip
     """Set the coefficients of the pressures of a block of cells and their derivatives.
 
@@ -69,7 +68,7 @@ def pressures_of_cells(
         part[:] = 0.0
     j[:] = 0.0
     for q in range(functions.shape[0]):
-        gradient(G, q, inverse, first_row(inverse, block, q), diagonal, H)
+        gradient(G, q, inverse, first_row(inverse, block, q), H)
         add_projected(load(weights, q) * point.change_of_volume(H, finite), functions[q], j)
     if mixed:
         for m in range(M):
@@ -130,7 +129,7 @@ def add_system(
     """
     (numbers, n_cells), (strain_gap, volume_gap) = cells, gap
     n, Q, dim = numbers.shape[1], dV.shape[1], u.shape[1]
-    mixed, moduli, diagonal = len(strain_gap) > 0, len(values) > 0, is_diagonal(inverse)
+    mixed, moduli = len(strain_gap) > 0, len(values) > 0
     if reference is None:
         dim = 3
         ue, fe, G, P = registers(24), registers(24), registers(72), registers(72)
@@ -162,19 +161,19 @@ def add_system(
             weights = dV[block if len(dV) > 1 else 0]
             own = volume_gap[block] if mixed else no_gap
             pressures_of_cells(
-                *(law, constants, finite, G, inverse, diagonal, block, weights, functions, bulk),
+                *(law, constants, finite, G, inverse, block, weights, functions, bulk),
                 *(own, work, pressures, low),
             )
         for q in range(Q):
             first, weight = first_row(inverse, block, q), load(dV, first_row(dV, block, q))
             if numba_laws.has_fibres(law):
                 gather_frame(frames, q, start, count, constants)
-            gradient(G, q, inverse, first, diagonal, H)
+            gradient(G, q, inverse, first, H)
             change = point.volume_change(H)
             if plain:
                 keep_minimum(change, low)
                 point.isotropic_stress(law, constants, finite, H, change, weight, T)
-                point.along(T, inverse, first, diagonal, P, 9 * q)
+                point.along(T, inverse, first, P, 9 * q)
                 continue
             for r in range(9):
                 store(F, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
@@ -211,13 +210,13 @@ def add_system(
                 if moduli:
                     for r in range(9):  # dJ/dF
                         store(T, r, point.cofactor(F, r // 3, r % 3))
-                    point.along(T, inverse, first, diagonal, H, 0)
+                    point.along(T, inverse, first, H, 0)
                     for m in range(M):
                         factor = weight * load(functions[q], m)
                         for r in range(9):
                             store(stresses[m], 9 * q + r, factor * load(H, r))
             point.nominal_stress(F, ahead, weight, T)
-            point.along(T, inverse, first, diagonal, P, 9 * q)
+            point.along(T, inverse, first, P, 9 * q)
             if moduli:
                 point.nominal_moduli(F, inverse, first, D, S, weight, finite, A, q, Q)
         forces_of_cell(reference, P, fe)
@@ -246,7 +245,7 @@ def update_gap(law, gap, length, update, u, cells, reference, inverse, dV, psi):
     """
     (numbers, _), (strain_gap, volume_gap) = cells, gap
     blocks, n, Q, dim = len(numbers), numbers.shape[1], dV.shape[1], u.shape[1]
-    M, diagonal = 0 if psi is None else psi.shape[2], is_diagonal(inverse)
+    M = 0 if psi is None else psi.shape[2]
     strains = np.zeros((blocks, Q, 6, SIMD_WIDTH))
     volumes = np.zeros((blocks, M, SIMD_WIDTH))
     if len(strain_gap) > 0:
@@ -263,12 +262,12 @@ def update_gap(law, gap, length, update, u, cells, reference, inverse, dV, psi):
             slopes_of_cell(reference, at, deformed)
         for q in range(Q):
             own, first = strains[block, q], first_row(inverse, block, q)
-            gradient(G, q, inverse, first, diagonal, H)
+            gradient(G, q, inverse, first, H)
             for r in range(9):
                 store(H, r, length * load(H, r))
             point.quadratic(H, 1.0, own)
             if psi is not None:
-                gradient(deformed, q, inverse, first, diagonal, F)
+                gradient(deformed, q, inverse, first, F)
                 weight = load(dV, first_row(dV, block, q))
                 change = point.second_volume_change(F, H)
                 functions = psi[block if len(psi) > 1 else 0]

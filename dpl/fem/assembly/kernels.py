@@ -27,7 +27,7 @@ Gap = tuple[Array, Array]  # of strains and, with mean dilatation, of volume cha
 NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH)), np.zeros((0, 0, SIMD_WIDTH))
 NO_VALUES = np.zeros(0)
 SPARE = 64  # places for entries that are not stored: additions to one place wait for each other
-AFFINE = 1e-13  # relative change or entry of the inverse Jacobian that counts as rounding
+AFFINE = 1e-13  # relative change of the inverse Jacobian in a cell that counts as rounding
 
 
 class Kernels:
@@ -66,8 +66,6 @@ class Kernels:
         inverse = np.linalg.pinv(reference) @ dN
         if np.allclose(inverse, inverse[:, :1], rtol=0, atol=AFFINE * np.abs(inverse).max()):
             inverse = inverse[:, :1]
-        if same:  # the Jacobians of boxes are diagonal
-            inverse[np.abs(inverse) < AFFINE * np.abs(inverse).max()] = 0.0
         missing = 3 - dN.shape[-1]
         inverse = np.pad(inverse, [(0, 0), (0, 0), (0, missing), (0, missing)])
         self.cells = _in_blocks(cells).astype(np.uint32)

@@ -113,27 +113,9 @@ def slopes_of_cell(reference, ue, G):
             store(G, 9 * q + r, load(total, r))
 
 
-@njit
-def is_diagonal(inverse):
-    """Return True if inverse Jacobians (blocks, Q, 9, SIMD_WIDTH) are diagonal: boxes, aligned."""
-    largest = 0.0
-    for r in range(9):
-        if r % 4 != 0:
-            largest = max(largest, np.abs(inverse[:, :, r]).max())
-    return largest == 0.0
-
-
 @inlined
-def gradient(G, q, inverse, first, diagonal, H):
-    """Set H (rows 3 i + j) to the gradient at a point, its inverse Jacobian from row `first`.
-
-    `diagonal` says that the Jacobian is a diagonal matrix.
-    """
-    if diagonal:
-        for i in range(3):
-            for j in range(3):
-                store(H, 3 * i + j, load(G, 9 * q + 3 * i + j) * load(inverse, first + 4 * j))
-        return
+def gradient(G, q, inverse, first, H):
+    """Set H (rows 3 i + j) to the gradient at a point, its inverse Jacobian from row `first`."""
     for i in range(3):
         g0, g1, g2 = load(G, 9 * q + 3 * i), load(G, 9 * q + 3 * i + 1), load(G, 9 * q + 3 * i + 2)
         for j in range(3):
