@@ -99,7 +99,7 @@ class LinearSolver:
 
     @cached_property
     def float32_factor(self) -> Factor:
-        """Factor of K(0), in float32 if it is banded: accurate to about 1e-6.
+        """Approximate factor of K(0): accurate to 1e-6 to 1e-5, or in full if it is not banded.
 
         Dense blocks of a nested condensation solve ten times as fast as bands. They take longer to
         compute, so that other parameters than the reference have a banded factor.
