@@ -32,7 +32,6 @@ from dpl.training import TrainedSurrogate
 ERROR = 1e-3  # estimated relative error in the modes at which steps end, and are not begun [-]
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
 WORTH = 1 / 3  # known error after steps over that before, below which they are made [-]
-MAX_RESIDUAL = 1.0  # above it the error outside of the modes is not that of the training [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 
 
@@ -325,7 +324,8 @@ class Simulator:
         first = self._evaluated(method, guess.displacement, load, request, taken)
         if self.newton is None or not first.state.residual.isfinite():
             return first
-        in_range = bool((first.state.volume_ratio > 0) & (first.state.residual < MAX_RESIDUAL))
+        limit = self.surrogate.largest_residual
+        in_range = bool((first.state.volume_ratio > 0) & (first.state.residual <= limit))
         enough = request.sufficient_error if taken < self.steps else FAR
         pays = guess.error > ERROR and guess.error_outside < WORTH * guess.error
         pays &= not request.is_more_than_prediction
@@ -342,7 +342,7 @@ class Simulator:
         if state.iterations:
             u, taken = state.displacement, taken + state.iterations
             first = self._evaluated("corrected", u, load, request, taken, state.evaluation)
-        outside = guess.error_outside if first.state.residual < MAX_RESIDUAL else math.inf
+        outside = guess.error_outside if first.state.residual <= limit else math.inf
         return first._replace(error_in_modes=state.error, error_outside=outside)
 
     def _evaluated(

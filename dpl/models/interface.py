@@ -96,7 +96,13 @@ class ClosedFormFit(Protocol):
 
 
 class HasCorrection(Protocol):
-    """A model whose fit includes Newton's method in its modes and estimates of its errors."""
+    """A model whose fit includes Newton's method in its modes and estimates of its errors.
+
+    Attributes:
+        largest_residual: Residual of a prediction up to which its estimated errors hold, () [-].
+    """
+
+    largest_residual: Tensor
 
     def forward_with_errors(
         self, force: Tensor, parameters: Tensor | None = None

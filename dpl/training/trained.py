@@ -51,6 +51,11 @@ class TrainedSurrogate(nn.Module):
         """
         return self.scene.length * self.predict(self.scene.load_of(force, young, parameters))
 
+    @property
+    def largest_residual(self) -> float:
+        """Residual up to which the errors of `predict_with_errors` hold [-]."""
+        return float(getattr(self.net, "largest_residual", math.inf))
+
     def predict(self, load: Load) -> Tensor:
         """Return displacements over L, (B, N, D) [-], float64."""
         return cast(Tensor, self.predictor(load))

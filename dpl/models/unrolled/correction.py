@@ -22,6 +22,31 @@ SUFFICIENT = 2e-3  # largest relative error of these loads that needs no further
 ERROR = 1e-5  # estimated relative error at which the steps end [-]
 RIDGE = 1.0  # of exponents, in squares of logarithms
 DEVIATIONS = 2.5  # standard deviations of fitted errors by which estimates exceed them
+SMALL = 0.1  # part of held-out samples whose sizes are too small for a fit of their errors
+LARGER = 3.0  # ratio to what the held-out samples have up to which values are plausible
+
+
+def error_buffers(
+    problem: Problem, held_out: Sample, guesses: Tensor, sizes: Tensor, left: Tensor
+) -> dict[str, Tensor]:
+    """Return the buffers of `Unrolled` for the estimated errors, by name.
+
+    Args:
+        problem: The body.
+        held_out, guesses: Held-out samples and their predictions, (S, N, D).
+        sizes: Sizes of the corrections of these predictions, (S, K + 2).
+        left: Relative errors of the first samples after all steps, (at most S,).
+    """
+    both = (sizes, relative_errors(held_out, guesses)), (sizes[: len(left)], left)
+    factors, exponents = zip(*(fit_errors(*pair) for pair in both), strict=True)
+    body = problem.with_parameters(held_out.parameters)
+    residuals = body.relative_residual_of(body.evaluate(guesses).internal, held_out.force)
+    return {
+        "error_factors": torch.stack(factors),
+        "error_exponents": torch.stack(exponents),
+        "least_sizes": sizes.quantile(SMALL, dim=0).clamp(min=1e-300),
+        "largest_residual": LARGER * residuals.max(),
+    }
 
 
 def fit_errors(sizes: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:

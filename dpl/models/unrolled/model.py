@@ -20,7 +20,7 @@ from dpl.models.interface import StoredBuffers, check_indices
 from dpl.models.linear_base import SCALE_STREAM
 from dpl.models.linear_response import Array, LinearResponse, OrbitArrays, Solve, largest
 from dpl.models.unrolled.compiled import LawArguments, law_arguments, model_arrays
-from dpl.models.unrolled.correction import choose_newton, fit_errors, relative_errors
+from dpl.models.unrolled.correction import LARGER, choose_newton, error_buffers
 from dpl.models.unrolled.fit import fit_in_best_modes, sampled_terms
 from dpl.models.unrolled.loops import ModelArrays, predict
 from dpl.models.unrolled.products import Tensors, in_rows, nonlinear_coordinates
@@ -29,8 +29,6 @@ from dpl.system.checks import check_range
 from dpl.system.threads import on_threads
 
 FEW = 8  # loads by which stored errors are compared with measured ones
-LARGER = 3.0  # smallest ratio of measured and stored errors up to which both are plausible
-SMALL = 0.1  # part of held-out samples whose sizes are too small for a fit of their errors
 MAX_SIZE = 100_000  # of rank, cells and stages
 # buffers and axes with the numbers of modes, cells, maps, and modes and cells of Newton's method
 SIZES = (("modes", 1), ("cells", 0), ("maps", 0), ("newton_modes", 1), ("newton_cells", 0))
@@ -86,13 +84,14 @@ class Unrolled(StoredBuffers):
         limits: Largest ratio of each correction to the one before, (1 + K,): 1.5 times that of the
             samples. They keep loads far out of range from running away.
         newton_modes: Modes of Newton's method that follows, (n, K).
-        newton_cells, newton_weights: Cells of its tangent, and their weights, (C,) each.
+        newton_cells, newton_weights: Cells of its tangent, and their weights, (C,).
         newton_gains: Gains of its steps, (K, K), see `SubspaceNewton`.
         error_factors, error_exponents: Estimated errors of the prediction, and of what Newton's
             method leaves, by the sizes of the corrections, (2,) and (2, K + 2), see `fit_errors`;
             the factors are logarithms.
         least_sizes: Sizes that a tenth of the held-out samples do not reach, (K + 2,). Smaller ones
             count as these.
+        largest_residual: `LARGER` times that of the held-out predictions, see `HasCorrection`.
         ratios: Measured over estimated errors of the first `FEW` loads of a stream, (`FEW`, 2).
         fitted: True after `fit`, ().
     """
@@ -112,6 +111,7 @@ class Unrolled(StoredBuffers):
     error_factors: Tensor
     error_exponents: Tensor
     least_sizes: Tensor
+    largest_residual: Tensor
     ratios: Tensor
     fitted: Tensor
     prescribed: Tensor
@@ -172,6 +172,7 @@ class Unrolled(StoredBuffers):
             "error_factors": ((2,), torch.float64),
             "error_exponents": ((2, 2 + maps), torch.float64),
             "least_sizes": ((2 + maps,), torch.float64),
+            "largest_residual": ((), torch.float64),
             "ratios": ((FEW, 2), torch.float64),
             "fitted": ((), torch.bool),
         }
@@ -341,10 +342,9 @@ class Unrolled(StoredBuffers):
         self.newton_modes = modes[0][:, : found.vectors.shape[2]].float()
         self.newton_cells, self.newton_weights = found.cubature.cells, found.cubature.weights
         self.newton_gains = cast("Tensor", found.gains)
-        both = (sizes, relative_errors(held_out, guesses)), (sizes[: len(left)], left)
-        columns = zip(*(fit_errors(*pair) for pair in both), strict=True)
-        self.error_factors, self.error_exponents = map(torch.stack, columns)
-        self.least_sizes = sizes.quantile(SMALL, dim=0).clamp(min=1e-300)
+        found_errors = error_buffers(self.scene.problem, held_out, guesses, sizes, left)
+        for name, buffer in found_errors.items():
+            setattr(self, name, buffer)
         self.ratios = self._ratios()
 
     def _of_dead_loads(self, samples: Sample) -> Sample:
@@ -391,7 +391,7 @@ class Unrolled(StoredBuffers):
         images = self.group.cell_images(problem)[:, cells.cpu()]
         if (cells.diff() <= 0).any() or not torch.isin(images, cells.cpu()).all():
             raise ValueError("cells must ascend and have all images under the symmetries")
-        for name in ("limits", "newton_weights", "least_sizes", "ratios"):
+        for name in ("limits", "newton_weights", "least_sizes", "largest_residual", "ratios"):
             if (getattr(self, name) < 0).any():
                 raise ValueError(f"{name} must be 0 or more")
         factors = self.terms.factors(self.terms.problem.reference.material)
