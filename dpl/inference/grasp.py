@@ -87,6 +87,7 @@ class Grip(NamedTuple):
     motion: Tensor  # translations over L [-] and rotation vectors [rad], (P, R)
     force: Tensor  # of the gripper at held degrees of freedom, (m,) [-]
     field: Tensor  # displacement, (N, D) [-]
+    error: float = 0.0  # its estimated relative error [-]
     frames: CorotatedFactor | None = None  # with the rotations of the nodes there, if computed
 
 
@@ -207,7 +208,8 @@ class Gripper:
                 is_near = request.spent or reached.known_error <= UNRELIABLE
                 if is_near and reached.force is not None:
                     field = reached.state.displacement[0]
-                    self._last.append(Grip(patch, motion, reached.force, field, frames))
+                    error = reached.known_error
+                    self._last.append(Grip(patch, motion, reached.force, field, error, frames))
                 return self._reported(body, load, best, request, frames, is_one=is_one)
 
     def _is_prepared(self, patch: RigidPatch, request: Request) -> bool:
@@ -260,15 +262,16 @@ class Gripper:
         self, end: HeldBody, start: Grip, motion: Tensor, parts: int, load: Load, request: Request
     ) -> Candidate | None:
         """Return the state after a motion in equal parts; None if one is inverted or time is up."""
-        field, frames, count, change = start.field, start.frames, 0, motion - start.motion
+        field, error, frames = start.field, start.error, start.frames
+        count, change = 0, motion - start.motion
         for k in range(1, parts + 1):
             body = end
             if k < parts:
                 body = self._held(end.patch, start.motion + (k / parts) * change, load, request)
-            found = body.corrected(body.moved(field, frames), self.steps, request)
+            found = body.corrected(body.moved(field, frames), self.steps, request, error)
             if found is None or (k < parts and request.over("step")):
                 return None
-            field, frames = found.state.displacement[0], None
+            field, error, frames = found.state.displacement[0], found.known_error, None
             count += int(found.state.iterations)
             best = found._replace(state=found.state._replace(iterations=torch.tensor([count])))
         return best

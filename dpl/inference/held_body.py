@@ -154,13 +154,16 @@ class HeldBody:
             errors.append(error.nan_to_num(math.inf, math.inf))
         return errors[0], errors[1]
 
-    def corrected(self, guess: Tensor, steps: int, request: Request) -> Candidate | None:
+    def corrected(
+        self, guess: Tensor, steps: int, request: Request, carried: float = 0.0
+    ) -> Candidate | None:
         """Return the iterate of least residual from a guess (N, D); None if that is inverted.
 
         Iterations with the corotated factor of K(0) end with the budget, or when the error is below
         `CORRECTED`: the last change times the ratio of the residuals after and before it, if this
         ratio is below `CONTRACTION`. Soft errors contract more slowly than residuals, so that the
-        ratio counts as at least `LEAST_RATE`.
+        ratio counts as at least `LEAST_RATE`. The first iteration may leave them as they are: the
+        error of the state from which the patch was moved to the guess, `carried`, is added.
         """
         valid: list[Solution] = []
         error = math.inf
@@ -176,6 +179,7 @@ class HeldBody:
                 ratio = float(state.residual / before.residual)
                 change = float((u - before.displacement).norm() / u.norm())
                 error = change * (max(ratio, LEAST_RATE) if ratio < CONTRACTION else 1.0)
+                error += carried if len(valid) == 2 else 0.0
                 if ratio < CONTRACTION and error < CORRECTED:
                     break
             if len(valid) <= steps and request.over("step"):

@@ -385,6 +385,17 @@ def test_a_budget_ends_newtons_method_and_the_answer_is_the_best_state(scene, mo
     assert "budget" not in met.summary
 
 
+def test_errors_that_frames_leave_one_after_the_other_are_seen(sim):
+    """The first iteration of a frame hardly reduces the soft error of the frames before it."""
+    hand = replace(sim.grasp, warm=True)
+    for k in range(1, 121):
+        found = hand(END, [0, 0, 0], [1.0 * k / 120, 0, 0])
+        if k % 20 == 0:
+            exact = sim.grasp(END, [0, 0, 0], [1.0 * k / 120, 0, 0], tol=1e-9).displacement
+            off = np.linalg.norm(found.displacement - exact) / np.linalg.norm(exact)
+            assert off / 3 < found.error < 1e-3
+
+
 def test_a_warm_start_needs_fewer_predictions(scene):
     sim = simulator_of(scene, steps=0)
     cold = sim.grasp(END, TRANSLATION, ROTATION)
