@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -46,8 +46,8 @@ class LinearResponse:
     K(0) is condensed once into dense blocks, one set for each parity of fields under the
     reflections of the body (`dpl.fem.linear.condensation`). A solution is a sequence of products
     with them, the same for every load: there is no basis that a load on a small area could miss.
-    If K(0) depends on parameters of the law, the blocks of one parameter are the preconditioner of
-    conjugate gradients (`StiffnessTerms`).
+    If K(0) depends on parameters of the law, the solutions of blocks for a few of them are
+    interpolated, or the blocks of one precondition conjugate gradients (`StiffnessTerms`).
 
     Compiled loops solve few loads on the CPU, and all that need steps, one after the other. Larger
     batches, other devices and traced graphs are solved by tensor operations.
@@ -81,13 +81,15 @@ class LinearResponse:
 
     @cached_property
     def blocks(self) -> Condensed:
-        """Blocks of the node, one matrix for each of M parities, `rounded`.
+        """Blocks of K bodies, one matrix for each of M parities, `rounded`.
 
         They are float64 if the solutions of random forces lose more than `MAX_ROUNDING`.
         """
-        matrices, points = self.form.matrices(self.terms.node_body), self.form.points
+        bodies, points = self.terms.kept_bodies, self.form.points
+        matrices = [matrix for body in bodies for matrix in self.form.matrices(body)]
         exact = condense(matrices, points)
-        found = rounded(exact, self._supports.numpy().reshape(-1, len(matrices), len(points)))
+        supports = self._supports.numpy().reshape(len(self._supports), -1, len(points))
+        found = rounded(exact, np.tile(supports, (1, len(bodies), 1)))
         forces = np.random.default_rng(0).standard_normal((len(matrices), len(points)))
         one, other = (condensed_solutions(blocks, forces) for blocks in (found, exact))
         loss = norm(one.astype(float) - other, axis=1) / norm(other, axis=1)
@@ -148,15 +150,23 @@ class LinearResponse:
 
     def _inverse(self, factors: Array) -> Callable[[Parts], Parts]:
         """Return f -> K(0)^-1 f, (M, m) each, of factors and 1, (T + 1,); f is of order one."""
-        if not self.terms.varies:
-            return partial(condensed_solutions, self.blocks)
-        shape, dtype = self.orbits.dofs.shape, self.blocks.dtype
+        weights = self.terms.weights(torch.from_numpy(factors[None, :-1]))[0].numpy()
+        shape, dtype, used = self.orbits.dofs.shape, self.blocks.dtype, weights.nonzero()[0]
+        own = slice(used[0] * shape[0], (used[-1] + 1) * shape[0])
+        table, unknowns, heights, values, scales = self.blocks
+        blocks = Condensed(table, unknowns, heights, values[own], scales[own])
+        weights = weights[used, None, None].astype(dtype)
+
+        def interpolate(parts: Parts) -> Parts:
+            found = condensed_solutions(blocks, (weights * parts).reshape(-1, shape[1]))
+            return found.reshape(-1, *shape).sum(axis=0)
+
+        if not self.terms.has_steps:
+            return interpolate
         matrix, ends = self._matrices.at(factors), (self.terms.rtol, 2 * self.terms.bound)
 
         def precondition(residual: Array) -> Array:
-            return (
-                condensed_solutions(self.blocks, residual.reshape(shape)).astype(np.float64).ravel()
-            )
+            return interpolate(residual.reshape(shape)).astype(np.float64).ravel()
 
         def solve(parts: Parts) -> Parts:
             right = parts.astype(np.float64).ravel()
@@ -215,7 +225,7 @@ class LinearResponse:
 
         The factors are those of the terms, and 1, (B, T + 1). All are float64.
         """
-        many = right.shape[0] > FEW and not self.terms.varies  # which need no steps
+        many = right.shape[0] > FEW and not self.terms.varies  # by the same blocks
         if right.device.type != "cpu" or many:
             return self.by_tensors(right, factors)
         size, shape = largest(right), self.orbits.dofs.shape
@@ -231,22 +241,25 @@ class LinearResponse:
         if not torch.compiler.is_compiling() and right.shape[0] > count:
             both = zip(right.split(count), factors.split(count), strict=True)
             return torch.cat([self.by_tensors(*pair) for pair in both])
+        weights = self.terms.weights(factors[:, :-1])[..., None, None]
+        parities = len(self.orbits.dofs)
 
-        def of_node(f: Tensor) -> Tensor:
-            forces = f.unflatten(1, (len(self.blocks.values), -1)).permute(1, 2, 0)
-            solved = solve_layers(layers, forces.to(layers.layers[0].inverse.dtype))
-            return solved.permute(2, 0, 1).flatten(1).double()
+        def interpolate(f: Tensor) -> Tensor:
+            forces = weights * f.unflatten(1, (1, parities, -1))
+            forces = forces.flatten(1, 2).permute(1, 2, 0).to(layers.layers[0].inverse.dtype)
+            solved = solve_layers(layers, forces).permute(2, 0, 1)
+            return solved.unflatten(1, (-1, parities)).sum(dim=1).flatten(1).double()
 
-        if not self.terms.varies:
+        if not self.terms.has_steps:
             size = largest(right)
-            return of_node(right / size) * size
+            return interpolate(right / size) * size
         matrix = torch.einsum("bk,knw->bnw", factors, entries)
 
         def product(x: Tensor) -> Tensor:
             return (matrix * x[:, columns]).sum(dim=-1)
 
         ends = self.terms.rtol, 2 * self.terms.bound
-        return conjugate_gradients_of_tensors(product, of_node, right, *ends)
+        return conjugate_gradients_of_tensors(product, interpolate, right, *ends)
 
     @cached_property
     def _run(self) -> int:
@@ -275,7 +288,7 @@ class LinearResponse:
         return self._on(device, "orbits", make)
 
     def tensors(self, device: torch.device) -> list[Any]:
-        """Return `condensed_layers` of the node, columns and entries of `TermMatrices.padded`."""
+        """Return `condensed_layers`, and columns and entries of `TermMatrices.padded`."""
 
         def make() -> list[Any]:
             terms = self._matrices.padded() if self.terms.varies else (torch.zeros(0).long(),) * 2

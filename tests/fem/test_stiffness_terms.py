@@ -114,6 +114,43 @@ def test_the_error_of_every_force_and_parameter_is_small_after_at_most_the_steps
             assert error @ matrix @ error < MAX_ERROR**2 * (exact @ matrix @ exact)
 
 
+@pytest.mark.parametrize(
+    ("law", "kept"),
+    [
+        (NeoHookeanLn([0.3, 0.3001]), 2),
+        (NeoHookeanLn([0.29, 0.31]), 4),
+        (RANGED_LAW, 9),
+        (NeoHookeanLn([0.2, 0.44]), 8),
+        (regions(NeoHookeanLn(0.3, [1, 3]), NeoHookeanLn(0.2, [1, 2])), 8),
+    ],
+    ids=str,
+)
+def test_the_error_of_interpolated_inverses_is_small_for_every_force_and_parameter(grid, law, kept):
+    where = REGION if isinstance(law, dict) else {}
+    mesh = grid("hexahedron", 3, shaken=0.2, inside=True)
+    terms = StiffnessTerms.of(
+        fem.Problem.build(mesh, law, regions=where, fixed=fem.Plane(0, "min"))
+    )
+    inverses = np.stack([np.linalg.inv(dense(body)) for body in terms.kept_bodies])
+    assert len(inverses) == kept
+    ends = torch.tensor(list(terms.problem.parameter_ranges.values())).double().T
+    for own in torch.cat([random_parameters(terms.problem, 8), ends]):
+        body = terms.problem.with_parameters(own[None])
+        weights = terms.weights(terms.factors(body.material))[0].numpy()
+        assert np.count_nonzero(weights) <= 4
+        root = np.linalg.cholesky(dense(body))
+        found = root.T @ np.tensordot(weights, inverses, 1) @ root
+        assert np.abs(np.linalg.eigvalsh(found) - 1).max() <= MAX_ERROR
+
+
+def test_wide_ranges_three_terms_and_foundations_need_conjugate_gradients(grid):
+    kinds = [("a stiff core", ()), ("a core and Poisson's ratio", ()), ("Poisson's ratio", SPRINGS)]
+    for name, supports in kinds:
+        terms = terms_of(grid, name, supports)
+        assert terms.has_steps
+        assert terms.kept_bodies == [terms.node_body]
+
+
 def system(size=40, seed=0):
     """Return a random positive definite matrix, the inverse of one near it, and a force."""
     random = np.random.default_rng(seed)

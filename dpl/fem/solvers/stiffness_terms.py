@@ -1,12 +1,14 @@
 """K(0) of a body as a sum of a few matrices whose factors are functions of the parameters.
 
-K(0)^-1 f of any parameters follows by conjugate gradients, preconditioned with the inverse for one.
+K(0)^-1 f of any parameters is interpolated between inverses for a few of them, or follows by
+conjugate gradients that the inverse for one preconditions.
 """
 
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,8 +24,40 @@ SAMPLES = 64  # points of the parameters at which moduli are compared
 INDEPENDENT = 1e-10  # part of the largest modulus below which a direction counts as rounding [-]
 MAX_CELLS = 32  # different cells by which condition numbers are bounded
 MAX_CORNERS = 6  # parameters of which all corners of the ranges are samples
-MAX_ERROR = 1e-4  # energy norm of the error of an iterated solution over that of the solution [-]
+MAX_ERROR = 1e-4  # energy norm of the error of a solution over that of the solution [-]
+MAX_NODES, MAX_USED = 9, 4  # inverses that are kept, and those that a solution interpolates between
 MAX_BOUND = 200  # largest value of `StiffnessTerms.bound`
+
+
+class Interpolation(NamedTuple):
+    """K(a)^-1 = sum_i w_i(a) K(a_i)^-1 with the inverses at nodes a_i, for two terms.
+
+    The energy of a displacement is (1 - q) b_0 + q b_1, where b are the stiffnesses of the two
+    extreme strains and q is a number from 0 to 1 of this displacement. The range of x = b_1 / b_0
+    is divided into K intervals of L nodes x_i. The weights in an interval are exact for L numbers
+    q_j, so that the error of every load in the energy norm, over that of the solution, is at most
+
+        max |prod_j (x - x_j) (q - q_j) / ((1 - q_j + q_j x) (1 - q + q x_j))|
+
+    The nodes and q_j make it nearly the smallest one, which is attained at the ends x and q = 0.
+
+    Source: Beckermann, Townsend (2017), SIAM J. Matrix Anal. Appl. 38 (Zolotarev's third problem).
+    """
+
+    nodes: Tensor  # factors a_i, (K L, 2)
+    strains: Tensor  # b of a, (2, 2)
+    ends: Tensor  # between intervals of x, (K - 1,)
+    q: Tensor  # (K, L)
+    inverse: Tensor  # of the matrices 1 / (1 - q_j + q_j x_i), (K, L, L)
+
+    def weights(self, factors: Tensor) -> Tensor:
+        """Return w, (B, K L), of factors (B, 2); only those of one interval are not zero."""
+        _, strains, ends, q, inverse = (part.to(factors) for part in self)
+        b_0, b_1 = (factors @ strains.mT)[..., None].unbind(1)
+        exact = 1 / (b_0[..., None] * (1 - q) + b_1[..., None] * q)
+        interval = (b_1 / b_0 > ends).sum(dim=1, keepdim=True)
+        is_used = torch.arange(len(q), device=q.device) == interval
+        return (is_used[..., None] * torch.einsum("kij,bkj->bki", inverse, exact)).flatten(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +69,8 @@ class StiffnessTerms:
     is a basis. A homogeneous isotropic law has the factors mu and lambda. Otherwise the basis
     consists of moduli of the law itself, so that the matrices K_k are positive definite.
 
-    The inverse for one point of the ranges, the node, is the preconditioner of all others. The
+    Two terms without a foundation have an `Interpolation` unless the ranges are too wide. Otherwise
+    the inverse for one point of the ranges, the node, is the preconditioner of all others. The
     condition number of K(node)^-1 K(0) is bounded for every load (`condition_numbers`), and with it
     the error of conjugate gradients in the energy norm and their number of steps. Neither depends
     on the number of terms.
@@ -96,6 +131,51 @@ class StiffnessTerms:
         if not self.varies:
             return body
         return replace(body, material=linear_law(body.material, self.node[0] @ self.vectors))
+
+    @cached_property
+    def interpolation(self) -> Interpolation | None:
+        """The interpolation with the fewest inverses; None if one is enough or more are not."""
+        if not self.varies or len(self) != 2 or self.problem.springs is not None:
+            return None
+        samples, node = self._sampled_factors, self.node
+        low, high = (end[:, None] for end in self._ratios(samples, node))
+        farthest = int((high / low).argmax())
+        b = torch.stack([torch.ones(2), torch.cat([low, high], dim=1)[farthest]])
+        strains = torch.linalg.solve(torch.stack([node[0], samples[farthest]]), b).mT
+        b_0, b_1 = strains @ samples.mT
+        least, most = (b_1 / b_0).aminmax()
+        for used, count in product(range(1, MAX_USED + 1), range(1, MAX_NODES + 1)):
+            t = np.sin(0.5 * np.pi * np.arange(1 - used, used, 2) / used)
+            ends = np.geomspace(least, most, 2 * count + 1)
+            middles, root = ends[1::2, None], math.sqrt(ends[2] / ends[0])
+            d = (root - 1) / (root + 1) * t
+            x, q = middles * (1 + d) / (1 - d), (1 - t) / (1 - t + middles * (1 + t))
+            error = np.prod(q * np.abs(ends[0] - x) / (1 - q + q * ends[0]), axis=1)[0]
+            if used * count <= MAX_NODES and error <= MAX_ERROR:
+                inverse = np.linalg.inv(1 / (1 - q[..., None] + q[..., None] * x[:, None]))
+                nodes = np.linalg.solve(strains, np.stack([np.ones(x.size), x.ravel()])).T
+                arrays = nodes, strains.numpy(), ends[2:-1:2], q, inverse
+                return Interpolation(*map(torch.from_numpy, arrays))
+        return None
+
+    @property
+    def has_steps(self) -> bool:
+        """True if solutions need conjugate gradients."""
+        return self.varies and self.interpolation is None
+
+    @cached_property
+    def kept_bodies(self) -> list[Problem]:
+        """Bodies whose inverses are kept: at the nodes of the interpolation, or `node_body`."""
+        if self.interpolation is None:
+            return [self.node_body]
+        body, moduli = self.problem.reference, self.interpolation.nodes @ self.vectors
+        return [replace(body, material=linear_law(body.material, row)) for row in moduli]
+
+    def weights(self, factors: Tensor) -> Tensor:
+        """Return weights of the inverses of `kept_bodies`, (B, K), for factors (B, T)."""
+        if self.interpolation is None:
+            return factors.new_ones(len(factors), 1)
+        return self.interpolation.weights(factors)
 
     @cached_property
     def varies(self) -> bool:
@@ -162,6 +242,11 @@ class StiffnessTerms:
         `MAX_CELLS` are taken. With mean dilatation the bound is approximate for laws with fibres,
         whose strain has the volume change of the point and not of the cell.
         """
+        low, high = self._ratios(factors, node)
+        return high / low
+
+    def _ratios(self, factors: Tensor, node: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the smallest and the largest ratio of energies, (S,), see `condition_numbers`."""
         moduli = self._some_cells
         of_node, others = (torch.einsum("st,teij->seij", a, moduli) for a in (node, factors))
         inverse = torch.linalg.inv(torch.linalg.cholesky(of_node))
@@ -169,7 +254,7 @@ class StiffnessTerms:
         low, high = ratios.amin(dim=1), ratios.amax(dim=1)
         if self.problem.springs is not None:
             low, high = low.clamp(max=1.0), high.clamp(min=1.0)
-        return high / low
+        return low, high
 
     @cached_property
     def _some_cells(self) -> Tensor:
