@@ -32,14 +32,14 @@ MAX_BOUND = 200  # largest value of `StiffnessTerms.bound`
 class Interpolation(NamedTuple):
     """K(a)^-1 = sum_i w_i(a) K(a_i)^-1 with the inverses at nodes a_i, for two terms.
 
-    The energy of a displacement is (1 - q) b_0 + q b_1, where b are the stiffnesses of the two
-    extreme strains and q is a number from 0 to 1 of this displacement. The range of x = b_1 / b_0
-    is divided into K intervals of L nodes x_i. The weights in an interval are exact for L numbers
-    q_j, so that the error of every load in the energy norm, over that of the solution, is at most
+    The energy of a displacement is (1 - q) b_0 + q b_1 with the stiffnesses b of the two extreme
+    strains and a number q from 0 to 1. The range of x = b_1 / b_0 is divided into K intervals of L
+    nodes x_i. The weights are exact for L numbers q_j, so that the error of every load in the
+    energy norm, over that of the solution, is at most the maximum of
 
-        max |prod_j (x - x_j) (q - q_j) / ((1 - q_j + q_j x) (1 - q + q x_j))|
+        |prod_j (x - x_j) (q - q_j) / ((1 - q_j + q_j x) (1 - q + q x_j))|
 
-    The nodes and q_j make it nearly the smallest one, which is attained at the ends x and q = 0.
+    at the ends of an interval and q = 0. The nodes and q_j make it nearly as small as possible.
 
     Source: Beckermann, Townsend (2017), SIAM J. Matrix Anal. Appl. 38 (Zolotarev's third problem).
     """
@@ -138,9 +138,9 @@ class StiffnessTerms:
         if not self.varies or len(self) != 2 or self.problem.springs is not None:
             return None
         samples, node = self._sampled_factors, self.node
-        low, high = (end[:, None] for end in self._ratios(samples, node))
-        farthest = int((high / low).argmax())
-        b = torch.stack([torch.ones(2), torch.cat([low, high], dim=1)[farthest]])
+        ratios = self._energy_ratios(samples, node)
+        farthest = int((ratios[:, 1] / ratios[:, 0]).argmax())
+        b = torch.stack([torch.ones(2), ratios[farthest]])
         strains = torch.linalg.solve(torch.stack([node[0], samples[farthest]]), b).mT
         b_0, b_1 = strains @ samples.mT
         least, most = (b_1 / b_0).aminmax()
@@ -242,11 +242,11 @@ class StiffnessTerms:
         `MAX_CELLS` are taken. With mean dilatation the bound is approximate for laws with fibres,
         whose strain has the volume change of the point and not of the cell.
         """
-        low, high = self._ratios(factors, node)
+        low, high = self._energy_ratios(factors, node).unbind(1)
         return high / low
 
-    def _ratios(self, factors: Tensor, node: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the smallest and the largest ratio of energies, (S,), see `condition_numbers`."""
+    def _energy_ratios(self, factors: Tensor, node: Tensor) -> Tensor:
+        """Return the smallest and the largest ratio, (S, 2), see `condition_numbers`."""
         moduli = self._some_cells
         of_node, others = (torch.einsum("st,teij->seij", a, moduli) for a in (node, factors))
         inverse = torch.linalg.inv(torch.linalg.cholesky(of_node))
@@ -254,7 +254,7 @@ class StiffnessTerms:
         low, high = ratios.amin(dim=1), ratios.amax(dim=1)
         if self.problem.springs is not None:
             low, high = low.clamp(max=1.0), high.clamp(min=1.0)
-        return low, high
+        return torch.stack([low, high], dim=1)
 
     @cached_property
     def _some_cells(self) -> Tensor:
