@@ -1,7 +1,7 @@
 """Compiled loops over dense blocks of condensed matrices, see `dpl.fem.linear.condensation`."""
 
 import numpy as np
-from numba import float32, float64, int16, int64, njit, void
+from numba import float64, int16, int64, njit, void
 
 LANES = 16  # entries of a row that a loop multiplies at once
 
@@ -55,24 +55,21 @@ def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
         i += 1
 
 
-@njit(
-    [
-        void(int64[:, ::1], int64[::1], A[:, ::1], x[:, :, ::1], x[:, ::1], x[:, ::1])
-        for A, x in ((int16, float32), (float64, float64))
-    ],
-    nogil=True,
-    cache=True,
-)
+@njit(nogil=True, cache=True)
 def condensed_solves(table, unknowns, values, factors, forces, solutions):  # type: ignore[no-untyped-def]
     """Set `solutions` (P, n) to those of P matrices, one force (P, n) each, of one type.
 
     The forces are overwritten. See `Condensed` for the other arguments.
     """
-    most = wide((table[:, 2] - table[:, 0]).max())
+    most = 0  # numba compiles the methods of arrays for a second
+    for s in range(len(table)):
+        most = max(most, wide(table[s, 2] - table[s, 0]))
     own, row = np.empty(most, forces.dtype), np.empty(most, forces.dtype)
     for p in range(len(values)):
-        force, solution = forces[p], solutions[p]
-        if not force.any():
+        force, solution, is_loaded = forces[p], solutions[p], False
+        for i in range(len(force)):
+            is_loaded |= force[i] != 0.0
+        if not is_loaded:
             solution[:] = 0.0
             continue
         of_inverse, of_coupling, columns = factors[p, 0], factors[p, 1], factors[p, 2]
