@@ -4,6 +4,7 @@ import atexit
 import contextlib
 import functools
 import gc
+import importlib
 import logging
 import math
 import os
@@ -48,16 +49,16 @@ def command(
     rehearse: Callable[[DictConfig], Any] | None = None,
     conf: Path = CONF,
     keys: Keys = (),
-    preload: str | None = None,
+    preload: Sequence[str] = (),
 ) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
     """Return a decorator that turns a function of a configuration into a command.
 
     Hydra composes the configuration from `NAME.yaml` in the folder `conf` and the command line. Its
     `hydra.searchpath` may contain `${oc.env:DPL_CONF}`, the folder of the configurations of this
     package. All jobs are checked before the first one starts, see `dpl.commands.dry_run.check` for
-    `rehearse` and `keys`. The server of worker processes imports the module `preload` meanwhile.
-    Invalid input ends the command with one line and status 2, Ctrl-C with status 130, SIGTERM with
-    status 143.
+    `rehearse` and `keys`. The server of worker processes imports the first module of `preload`,
+    whose kernels may have to be compiled, while this process imports the others. Invalid input ends
+    the command with one line and status 2, Ctrl-C with status 130, SIGTERM with status 143.
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
@@ -76,9 +77,11 @@ def command(
                         about = sys.modules[task.__module__].__doc__ or ""
                         page = help_page(args.config_name, about, args.overrides)
                         return print(page, flush=True)
-                    if preload is not None:
-                        workers_with(preload)
+                    if preload:
+                        workers_with(preload[0])
                     with _no_collection():
+                        for module in preload[1:]:
+                            importlib.import_module(module)
                         cfg = dry_run.check(args, rehearse, keys)
                     if not args.cfg and args.info is None:
                         return dry_run.run(engine, args, guarded, cfg)

@@ -1,7 +1,7 @@
 """Compiled loops over dense blocks of condensed matrices, see `dpl.fem.linear.condensation`."""
 
 import numpy as np
-from numba import float64, int16, int64, njit, void
+from numba import float32, float64, int16, int64, njit, void
 
 LANES = 16  # entries of a row that a loop multiplies at once
 
@@ -55,7 +55,14 @@ def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
         i += 1
 
 
-@njit(nogil=True, cache=True)
+@njit(
+    [
+        void(int64[:, ::1], int64[::1], A[:, ::1], x[:, :, ::1], x[:, ::1], x[:, ::1])
+        for A, x in ((int16, float32), (float64, float64))
+    ],
+    nogil=True,
+    cache=True,
+)
 def condensed_solves(table, unknowns, values, factors, forces, solutions):  # type: ignore[no-untyped-def]
     """Set `solutions` (P, n) to those of P matrices, one force (P, n) each, of one type.
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -133,7 +134,8 @@ def _decomposed(X: Tensor, Y: Tensor) -> _Decomposed:
     factors = torch.where(size > ROUNDING * size.max(), 1 / size, 0.0)
     X = X * factors
     is_dual = len(X) <= X.shape[1]
-    values, Q = torch.linalg.eigh(X @ X.T if is_dual else X.T @ X)
+    rows = X.numpy() if is_dual else X.T.numpy()  # numpy uses the symmetry of the product
+    values, Q = map(torch.from_numpy, np.linalg.eigh(rows @ rows.T))
     basis = factors[:, None] * (X.T @ Q if is_dual else Q)
     values = values.clamp(min=0) / max(X.shape[1], 1)
     return _Decomposed(values, Q if is_dual else X @ Q, basis, Y, is_dual)
