@@ -64,16 +64,16 @@ def one_thread() -> AbstractContextManager[None]:
     return limited_threads(1)
 
 
-def on_threads(call: Callable[[S], T], items: Sequence[S]) -> list[T]:
+def on_threads(call: Callable[[S], T], items: Sequence[S], *, fewest: int = FEWEST) -> list[T]:
     """Return the results of a call for each item, on as many threads as torch uses.
 
-    Each thread has `FEWEST` items or more. The threads run in parallel only where the call releases
-    the interpreter lock, as compiled loops with `nogil` do.
+    Each thread has `fewest` items or more, and each call one thread. The threads run in parallel
+    only where the call releases the interpreter lock, as compiled loops with `nogil` and BLAS do.
     """
-    count = min(torch.get_num_threads(), len(items) // FEWEST)
+    count = min(torch.get_num_threads(), len(items) // fewest)
     if count < 2:
         return [call(item) for item in items]
-    with ThreadPoolExecutor(count) as pool:
+    with one_thread(), ThreadPoolExecutor(count) as pool:
         return list(pool.map(call, items))
 
 

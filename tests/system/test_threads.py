@@ -33,3 +33,8 @@ def test_one_thread_makes_all_calls_itself_if_they_are_few_or_it_is_alone(two_th
     with one_thread() if count >= 2 * FEWEST else contextlib.nullcontext():
         found = on_threads(lambda _: threading.get_ident(), range(count))
     assert found == [threading.get_ident()] * count
+
+
+def test_each_call_has_one_thread_and_the_caller_has_its_own_again(two_threads):
+    assert on_threads(lambda _: torch.get_num_threads(), range(4), fewest=1) == [1] * 4
+    assert torch.get_num_threads() == 2

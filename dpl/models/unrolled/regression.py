@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.parity import Parities, SignedOrbits
+from dpl.system.threads import on_threads
 
 RIDGES = tuple(10.0**-k for k in range(16, 2, -1))  # relative to the mean square [-]
 GAIN_RIDGES = tuple(10.0**k for k in range(-6, 3))  # the same, of gains of a step
@@ -82,15 +83,16 @@ def fit_map(
     rest = targets - features @ prior
     if not (features.isfinite().all() and rest.isfinite().all()):
         raise ValueError("the samples are not finite")
-    blocks = []
-    for p, characters in enumerate(symmetry.parities.characters):
-        own = symmetry.coordinates == p
-        X = weights * orbits.coordinates(features, characters)
-        block = _decomposed(X, weights * rest[:, own])
-        blocks.append((own, characters, block))
-    ridge = _best_ridge([block for *_, block in blocks], RIDGES, images)
+    masks = [symmetry.coordinates == p for p in range(len(symmetry.parities.characters))]
+
+    def decomposed(p: int) -> _Decomposed:
+        X = weights * orbits.coordinates(features, symmetry.parities.characters[p])
+        return _decomposed(X, weights * rest[:, masks[p]])
+
+    blocks = on_threads(decomposed, range(len(masks)), fewest=1)
+    ridge = _best_ridge(blocks, RIDGES, images)
     matrix, left_out = torch.zeros_like(prior), torch.empty_like(rest)
-    for own, characters, block in blocks:
+    for own, characters, block in zip(masks, symmetry.parities.characters, blocks, strict=True):
         change = block.basis @ _solved(block, ridge)[0]
         matrix[:, own] = prior[:, own] + orbits.fields(change.T, characters, len(prior)).T
         left_out[:, own] = _left_out(block, ridge, images, len(rest))[0]
@@ -144,7 +146,11 @@ def _decomposed(X: Tensor, Y: Tensor) -> _Decomposed:
 def _best_ridge(blocks: Sequence[_Decomposed], ridges: Sequence[float], images: int) -> Tensor:
     """Return the ridge, (1,), with the smallest mean left-out error of all blocks."""
     every = blocks[0].values.new_tensor(ridges)
-    squares = [_left_out(block, every, images, CHOOSING).square().sum(dim=2) for block in blocks]
+
+    def squares_of(block: _Decomposed) -> Tensor:
+        return _left_out(block, every, images, CHOOSING).square().sum(dim=2)
+
+    squares = on_threads(squares_of, blocks, fewest=1)
     return every[torch.stack(squares).sum(dim=0).sqrt().mean(dim=1).argmin()][None]
 
 
