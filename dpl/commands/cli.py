@@ -4,7 +4,6 @@ import atexit
 import contextlib
 import functools
 import gc
-import importlib
 import logging
 import math
 import os
@@ -27,7 +26,6 @@ from dpl import config
 from dpl.commands import dry_run
 from dpl.config import CONF, ConfigError, Keys
 from dpl.system.files import DataSetError
-from dpl.system.processes import workers_with
 from dpl.version import install
 
 # turns overrides into the name of a folder that needs quotes in no command line
@@ -56,9 +54,8 @@ def command(
     Hydra composes the configuration from `NAME.yaml` in the folder `conf` and the command line. Its
     `hydra.searchpath` may contain `${oc.env:DPL_CONF}`, the folder of the configurations of this
     package. All jobs are checked before the first one starts, see `dpl.commands.dry_run.check` for
-    `rehearse` and `keys`. The server of worker processes imports the first module of `preload`,
-    whose kernels may have to be compiled, while this process imports the others. Invalid input ends
-    the command with one line and status 2, Ctrl-C with status 130, SIGTERM with status 143.
+    `rehearse`, `keys` and `preload`. Invalid input ends the command with one line and status 2,
+    Ctrl-C with status 130, SIGTERM with status 143.
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
@@ -77,12 +74,8 @@ def command(
                         about = sys.modules[task.__module__].__doc__ or ""
                         page = help_page(args.config_name, about, args.overrides)
                         return print(page, flush=True)
-                    if preload:
-                        workers_with(preload[0])
                     with _no_collection():
-                        for module in preload[1:]:
-                            importlib.import_module(module)
-                        cfg = dry_run.check(args, rehearse, keys)
+                        cfg = dry_run.check(args, rehearse, keys, preload)
                     if not args.cfg and args.info is None:
                         return dry_run.run(engine, args, guarded, cfg)
             return by_hydra()
