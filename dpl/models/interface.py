@@ -3,7 +3,7 @@
 A network of another package has a capability if it defines the methods; it need not inherit.
 """
 
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, NamedTuple, Protocol, Self
 
 import torch
@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from dpl.fem import SubspaceNewton
 from dpl.scene import Sample, Scene
-from dpl.system.threads import one_thread
 
 Base = Literal["linear"]
 
@@ -94,12 +93,6 @@ class ClosedFormFit(Protocol):
     def is_fitted(self) -> bool:
         """True after `fit`, or once a checkpoint has been loaded."""
         ...
-
-
-def try_fit(net: ClosedFormFit, samples: Sample) -> None:
-    """Fit a model to samples in a process that compiles kernels for others; ignore errors."""
-    with one_thread(), suppress(Exception):
-        net.fit(samples, samples)
 
 
 class HasCorrection(Protocol):

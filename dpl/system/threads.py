@@ -64,16 +64,17 @@ def one_thread() -> AbstractContextManager[None]:
     return limited_threads(1)
 
 
-def on_threads(call: Callable[[S], T], items: Sequence[S], *, fewest: int = FEWEST) -> list[T]:
+def on_threads(call: Callable[[S], T], items: Sequence[S], threads: int | None = None) -> list[T]:
     """Return the results of a call for each item, on as many threads as torch uses.
 
-    Each thread has `fewest` items or more, and each call one thread. The threads run in parallel
-    only where the call releases the interpreter lock, as compiled loops with `nogil` and BLAS do.
+    Each thread has `FEWEST` items or more, unless `threads` states their number. The threads run in
+    parallel only where the call releases the interpreter lock, as compiled loops with `nogil` and
+    BLAS do.
     """
-    count = min(torch.get_num_threads(), len(items) // fewest)
+    count = min(torch.get_num_threads(), len(items) // FEWEST) if threads is None else threads
     if count < 2:
         return [call(item) for item in items]
-    with one_thread(), ThreadPoolExecutor(count) as pool:
+    with ThreadPoolExecutor(count) as pool:
         return list(pool.map(call, items))
 
 

@@ -6,7 +6,6 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,11 +13,8 @@ import lightning as L
 import torch
 
 from dpl.data.datamodule import DataModule
-from dpl.fem.assembly.element_loops import add_system
-from dpl.fem.solvers.rotation_strain import warped_solution
-from dpl.models.interface import ClosedFormFit, try_fit
+from dpl.models.interface import ClosedFormFit
 from dpl.scene import Sample
-from dpl.system.processes import workers_with
 from dpl.training import checkpoints
 from dpl.training.callbacks.tensorboard import LogHyperparameters
 from dpl.training.callbacks.throughput import TrainingTime, resident_memory
@@ -26,8 +22,6 @@ from dpl.training.callbacks.worst_cases import WorstCasePlots
 from dpl.training.metrics import ErrorMetrics
 from dpl.training.surrogate import Surrogate
 
-COMPILED_STREAM = 8  # stream of the loads to which a model is fitted that compiles the kernels
-FEW = 16  # loads of this stream
 # metrics of a learning curve, by their names there
 OF_CURVE = {"median": "rel_L2_median", "worst": "rel_L2_worst", "e_mean": "e_mean"}
 OBSERVERS = (LogHyperparameters, TrainingTime, WorstCasePlots)
@@ -67,7 +61,6 @@ def fit(
             if isinstance(one, OBSERVERS):
                 getattr(one, hook)(trainer, surrogate, *more)
 
-    ahead = _compiled_ahead(net, data)
     done = [point.e_mean for point in data.source.points]
     best, first, step = min(filter(math.isfinite, done), default=math.inf), len(done), None
     try:
@@ -78,8 +71,6 @@ def fit(
                     call("on_train_start")
                     call("on_train_epoch_start")
                 data.sizes |= sizes
-                if ahead is not None:  # threads of both would wait for each other
-                    ahead.join()
                 net.fit(data.samples("train"), data.samples("val"))
                 errors = found = errors_on(surrogate, data.val_dataloader())
                 if (unseen := data.source.unseen(data.store, sizes["train"])) is not None:
@@ -100,31 +91,10 @@ def fit(
             call("on_train_end")
     finally:
         data.source.close()
-        if ahead is not None:
-            ahead.kill()
         call("on_fit_end")
         for logger in loggers:
             logger.finalize("finished")
     return best
-
-
-def _compiled_ahead(net: ClosedFormFit, data: DataModule) -> BaseProcess | None:
-    """Start a process that compiles the kernels of a fit while loads are solved, if none are there.
-
-    It fits to approximate solutions of a few loads. The fit then finds the kernels in numba's
-    cache. There are none on disk if this process had to compile the first kernel.
-    """
-    scene, is_new = data.scene, bool(add_system.stats.cache_misses)
-    if not (is_new and data.workers and any(data.dataset.missing().values())):
-        return None
-    loads = scene.loads.sample((0, COMPILED_STREAM), range(FEW))
-    linear = [scene.linear.with_parameters(one) for one in loads.parameters.split(1)]
-    states = torch.cat([*map(warped_solution, linear, loads.unbatch())])
-    samples = Sample(loads.force, states, loads.young, loads.parameters)
-    context = workers_with("dpl.data.solving.worker_pool")
-    process = context.Process(target=try_fit, args=(net, samples), daemon=True)
-    process.start()
-    return process
 
 
 def errors_on(surrogate: Surrogate, batches: Iterable[Sample]) -> dict[str, float]:

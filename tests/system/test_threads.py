@@ -35,6 +35,6 @@ def test_one_thread_makes_all_calls_itself_if_they_are_few_or_it_is_alone(two_th
     assert found == [threading.get_ident()] * count
 
 
-def test_each_call_has_one_thread_and_the_caller_has_its_own_again(two_threads):
-    assert on_threads(lambda _: torch.get_num_threads(), range(4), fewest=1) == [1] * 4
-    assert torch.get_num_threads() == 2
+def test_few_items_are_shared_by_the_threads_that_are_asked_for():
+    meeting = threading.Barrier(2, timeout=20)
+    assert sorted(on_threads(lambda _: meeting.wait(), range(2), 2)) == [0, 1]

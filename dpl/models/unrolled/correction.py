@@ -10,6 +10,7 @@ from dpl.fem.rom.pod import orthonormal_fields
 from dpl.models.unrolled.fit import sample_weights
 from dpl.models.unrolled.regression import fit_gains
 from dpl.scene import Sample
+from dpl.system.threads import one_thread
 
 RANKS = (60, 100, 160)  # numbers of modes that are tried, and all modes
 CANDIDATES = 600  # cells to choose from
@@ -148,11 +149,12 @@ def with_gains(
 def _corrected(solver: SubspaceNewton, samples: Sample, guesses: Tensor) -> tuple[Tensor, Tensor]:
     """Return displacements (S, N, D) of the first samples after one and after `MAX_STEPS` steps."""
     found = []
-    for load, guess in zip(samples.load.unbatch(), guesses.split(1), strict=False):
-        states = list(solver.states(load, guess=guess, max_iter=MAX_STEPS, error_tol=ERROR))
-        # the guess, too, may be the best state after one step
-        one = min(states[:2], key=lambda state: state.error)
-        found.append((one.displacement, states[-1].displacement))
+    with one_thread():
+        for load, guess in zip(samples.load.unbatch(), guesses.split(1), strict=False):
+            states = list(solver.states(load, guess=guess, max_iter=MAX_STEPS, error_tol=ERROR))
+            # the guess, too, may be the best state after one step
+            one = min(states[:2], key=lambda state: state.error)
+            found.append((one.displacement, states[-1].displacement))
     first, last = map(torch.cat, zip(*found, strict=True))
     return first, last
 

@@ -52,6 +52,7 @@ def fit_map(
     symmetry: MapParities,
     prior: Tensor,
     images: int = 1,
+    threads: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """Return the linear map (C F D D, R) from features to targets, and left-out errors (S, R).
 
@@ -74,6 +75,7 @@ def fit_map(
         symmetry: Parities of features and targets.
         prior: Map that the ridge shrinks to, (C F D D, R).
         images: Number of rows of each sample, its images; row k S / images + s belongs to sample s.
+        threads: Number of threads that decompose the regressions of the parities.
 
     Raises:
         ValueError: The rows are not finite.
@@ -89,7 +91,7 @@ def fit_map(
         X = weights * orbits.coordinates(features, symmetry.parities.characters[p])
         return _decomposed(X, weights * rest[:, masks[p]])
 
-    blocks = on_threads(decomposed, range(len(masks)), fewest=1)
+    blocks = on_threads(decomposed, range(len(masks)), threads)
     ridge = _best_ridge(blocks, RIDGES, images)
     matrix, left_out = torch.zeros_like(prior), torch.empty_like(rest)
     for own, characters, block in zip(masks, symmetry.parities.characters, blocks, strict=True):
@@ -146,11 +148,7 @@ def _decomposed(X: Tensor, Y: Tensor) -> _Decomposed:
 def _best_ridge(blocks: Sequence[_Decomposed], ridges: Sequence[float], images: int) -> Tensor:
     """Return the ridge, (1,), with the smallest mean left-out error of all blocks."""
     every = blocks[0].values.new_tensor(ridges)
-
-    def squares_of(block: _Decomposed) -> Tensor:
-        return _left_out(block, every, images, CHOOSING).square().sum(dim=2)
-
-    squares = on_threads(squares_of, blocks, fewest=1)
+    squares = [_left_out(block, every, images, CHOOSING).square().sum(dim=2) for block in blocks]
     return every[torch.stack(squares).sum(dim=0).sqrt().mean(dim=1).argmin()][None]
 
 
