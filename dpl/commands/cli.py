@@ -1,7 +1,9 @@
 """Start and end of a command: configuration, checks, one line for invalid input."""
 
+import atexit
 import contextlib
 import functools
+import gc
 import logging
 import math
 import os
@@ -45,14 +47,15 @@ def command(
     rehearse: Callable[[DictConfig], Any] | None = None,
     conf: Path = CONF,
     keys: Keys = (),
+    preload: Sequence[str] = (),
 ) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
     """Return a decorator that turns a function of a configuration into a command.
 
     Hydra composes the configuration from `NAME.yaml` in the folder `conf` and the command line. Its
     `hydra.searchpath` may contain `${oc.env:DPL_CONF}`, the folder of the configurations of this
     package. All jobs are checked before the first one starts, see `dpl.commands.dry_run.check` for
-    `rehearse` and `keys`. Invalid input ends the command with one line and status 2, Ctrl-C with
-    status 130, SIGTERM with status 143.
+    `rehearse`, `keys` and `preload`. Invalid input ends the command with one line and status 2,
+    Ctrl-C with status 130, SIGTERM with status 143.
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
@@ -71,7 +74,8 @@ def command(
                         about = sys.modules[task.__module__].__doc__ or ""
                         page = help_page(args.config_name, about, args.overrides)
                         return print(page, flush=True)
-                    cfg = dry_run.check(args, rehearse, keys)
+                    with _no_collection():
+                        cfg = dry_run.check(args, rehearse, keys, preload)
                     if not args.cfg and args.info is None:
                         return dry_run.run(engine, args, guarded, cfg)
             return by_hydra()
@@ -79,6 +83,20 @@ def command(
         return main
 
     return decorate
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Collect no garbage meanwhile, and none at the end of the interpreter.
+
+    Imports make a million objects that live until then; to search them takes seconds.
+    """
+    atexit.register(gc.freeze)
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
 
 
 def help_page(name: str, about: str, lines: Sequence[str]) -> str:

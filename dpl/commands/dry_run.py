@@ -2,6 +2,7 @@
 
 import contextlib
 import difflib
+import importlib
 import logging
 import re
 from argparse import Namespace
@@ -27,6 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dpl import config
 from dpl.config import ConfigError, validation
+from dpl.system.processes import workers_with
 from dpl.version import install
 
 REMOTE = "submitit"  # launchers on other machines, whose hardware may differ
@@ -84,16 +86,24 @@ def check(
     args: Namespace,
     rehearse: Callable[[DictConfig], Any] | None = None,
     keys: config.Keys = (),
+    preload: Sequence[str] = (),
 ) -> DictConfig | None:
     """Compose and check every job of a command line; return a single one, None for a sweep.
 
     The configuration of a single job has the node `hydra`. `rehearse` builds the objects of a job
     without computing. It is called for the jobs of a sweep on this machine; a single job builds its
     objects when it runs. For `keys` see `dpl.config.validation.check`.
+
+    Once the command line is composed, the server of worker processes imports the first module of
+    `preload`, whose kernels may have to be compiled, while this process imports the others.
     """
     first, jobs = _jobs(args)
     if args.cfg or args.info is not None:
         return None
+    if preload:
+        workers_with(preload[0])
+    for module in preload[1:]:
+        importlib.import_module(module)
     with config.error_in("run", OmegaConfBaseException):
         first.hydra.run.dir  # noqa: B018  # raises if `run` is no text
     different: dict[str, DictConfig] = {}

@@ -17,7 +17,7 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", "dpl.DataSet"]:
     return scene, config.instantiate(cfg, "data", scene=scene)
 
 
-@command("generate", rehearse=parts)
+@command("generate", rehearse=parts, preload=["dpl.data.solving.worker_pool"])
 def main(cfg: DictConfig) -> None:
     """Generate the missing loads of a data set, or verify or repair it."""
     scene, data = parts(cfg)

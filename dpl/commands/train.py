@@ -47,7 +47,7 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", "data.DataModule", "dpl.Surroga
     return scene, module, surrogate, trainer
 
 
-@cli.command("train", rehearse=parts)
+@cli.command("train", rehearse=parts, preload=["dpl.data.solving.worker_pool", "lightning"])
 def main(cfg: DictConfig) -> float | None:
     """Train and evaluate a surrogate; return its smallest validation e_mean [-] to a search."""
     cfg = config.resumed_config(cfg, HydraConfig.get().overrides.task)

@@ -72,7 +72,7 @@ def export_onnx(
             cause = next(line for line in (*str(error).splitlines(), type(error).__name__) if line)
             raise ValueError(f"{name} cannot be written as an ONNX graph: {cause}") from error
         if dtype == "float32":
-            _to_float32(exported.model)
+            to_float32(exported.model)
         path.parent.mkdir(parents=True, exist_ok=True)
         for old in (path, path.with_name(f"{path.name}.data")):
             old.unlink(missing_ok=True)
@@ -80,7 +80,7 @@ def export_onnx(
     onnx.checker.check_model(str(path))
 
 
-def _to_float32(model: Any) -> None:
+def to_float32(model: Any) -> None:
     """Replace float64 by float32 in an `onnx_ir.Model`: values, constants and casts."""
     import onnx_ir as ir
 

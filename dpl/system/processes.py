@@ -1,44 +1,43 @@
 """Worker processes that end when their parent process ends."""
 
-import contextlib
 import ctypes
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator
-from multiprocessing import resource_tracker
-from multiprocessing.context import SpawnContext
+from multiprocessing import forkserver, resource_tracker
+from multiprocessing.context import ForkServerContext
 
 
 def die_with_parent() -> None:
-    """End this worker process as soon as its parent process has ended, or at once if it has.
+    """End this worker of `workers_with` as soon as its parent has ended, or at once if it has.
 
-    The kernel does it (`prctl`). The end of the parent's thread that started this process counts.
+    The kernel does it (`prctl`) with the end of the server, which ends with the last process that
+    holds a certain pipe. This worker closes it.
     """
     set_death_signal = 1  # PR_SET_PDEATHSIG
     ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
+    os.close(forkserver._forkserver._forkserver_alive_fd)  # type: ignore[attr-defined]
     parent = multiprocessing.parent_process()
-    if parent is not None and os.getppid() != parent.pid:  # it ended before the lines above
+    if parent is not None and not parent.is_alive():  # it ended before the lines above
         os._exit(1)
 
 
-def spawn_context() -> SpawnContext:
-    """Return a multiprocessing context that spawns workers.
+def workers_with(module: str) -> ForkServerContext:
+    """Return a multiprocessing context whose workers have imported a module.
 
-    Workers are not forked, because forking a process with BLAS threads can hang it.
+    A server process imports it once, beginning with this call, and forks the workers. It ends after
+    this process and them. This process itself, which has BLAS threads, is not forked: that can hang
+    a worker. SIGINT and SIGTERM are blocked in the workers; the parent handles them.
     """
     # processes of joblib have a start method that their own workers do not know
     if multiprocessing.get_start_method() not in multiprocessing.get_all_start_methods():
-        multiprocessing.set_start_method("spawn", force=True)
-    return multiprocessing.get_context("spawn")
-
-
-@contextlib.contextmanager
-def block_signals(*numbers: signal.Signals) -> Iterator[None]:
-    """Block signals in the processes that are started in this context; the parent handles them."""
-    resource_tracker.ensure_running()  # its start would unblock them
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+        multiprocessing.set_start_method("forkserver", force=True)
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([module])
+    resource_tracker.ensure_running()  # its start would unblock the signals
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     try:
-        yield
+        forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return context

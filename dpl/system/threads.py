@@ -64,13 +64,14 @@ def one_thread() -> AbstractContextManager[None]:
     return limited_threads(1)
 
 
-def on_threads(call: Callable[[S], T], items: Sequence[S]) -> list[T]:
+def on_threads(call: Callable[[S], T], items: Sequence[S], threads: int | None = None) -> list[T]:
     """Return the results of a call for each item, on as many threads as torch uses.
 
-    Each thread has `FEWEST` items or more. The threads run in parallel only where the call releases
-    the interpreter lock, as compiled loops with `nogil` do.
+    Each thread has `FEWEST` items or more, unless `threads` states their number. The threads run in
+    parallel only where the call releases the interpreter lock, as compiled loops with `nogil` and
+    BLAS do.
     """
-    count = min(torch.get_num_threads(), len(items) // FEWEST)
+    count = min(torch.get_num_threads(), len(items) // FEWEST) if threads is None else threads
     if count < 2:
         return [call(item) for item in items]
     with ThreadPoolExecutor(count) as pool:

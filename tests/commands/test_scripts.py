@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -160,15 +161,13 @@ def streaming(start, members, tiny_training, tmp_path):
     assert process.poll() is None, process.communicate()[1][-2000:]
 
     def workers():
-        found = []
+        parents = {}  # of the workers and their server
         for pid in members(process.pid):
-            try:
-                line = Path(f"/proc/{pid}/cmdline").read_text()
-            except OSError:
-                continue
-            if "spawn_main" in line:
-                found.append(pid)
-        return found
+            with suppress(OSError):  # it has just ended
+                if "forkserver" in Path(f"/proc/{pid}/cmdline").read_text():
+                    stat = Path(f"/proc/{pid}/stat").read_text()
+                    parents[pid] = int(stat.rpartition(")")[2].split()[1])
+        return [pid for pid, parent in parents.items() if parent in parents]
 
     assert len(workers()) == 2
     return process, workers

@@ -104,16 +104,15 @@ def waited_for(condition):
 
 
 def workers_of(members, group):
-    """Return the living worker processes of a process group."""
-    found = []
+    """Return the living worker processes of a process group, children of their server."""
+    parents = {}
     for pid in members(group):
-        try:
-            line = Path(f"/proc/{pid}/cmdline").read_text()
-        except OSError:
-            continue
-        if "spawn_main" in line:
-            found.append(pid)
-    return found
+        with suppress(OSError):  # it has just ended
+            if "forkserver" in Path(f"/proc/{pid}/cmdline").read_text():
+                parents[pid] = int(
+                    Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]
+                )
+    return [pid for pid, parent in parents.items() if parent in parents]
 
 
 def gone(members, group):

@@ -9,6 +9,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
+from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
@@ -93,7 +94,7 @@ def test_loads_are_solved_in_the_order_of_the_jobs_without_workers(scene, jobs, 
 
 
 def test_no_jobs_cost_no_process(scene, monkeypatch):
-    monkeypatch.setattr(worker_pool, "spawn_context", lambda: None)  # nothing can be started
+    monkeypatch.setattr(worker_pool, "workers_with", lambda module: None)  # nothing can be started
     assert list(solve_loads(scene, [], workers=2)) == []
 
 
@@ -147,6 +148,7 @@ def test_workers_that_exceed_the_time_limit_while_starting_are_replaced(scene, m
 
 def test_workers_that_all_die_end_the_run(scene, monkeypatch, capfd):
     monkeypatch.setattr(worker_pool, "MAX_CONSECUTIVE_CRASHES", 1)
+    forkserver._forkserver._stop()  # the next server has the streams of this test
     victim = fragile(scene, {0: "raise"})
     with pytest.raises(RuntimeError, match="1 workers died in a row"):
         list(solve_loads(victim, _jobs(0), workers=1))

@@ -15,16 +15,15 @@ LONG = 120  # limit for an event; reached only if a process is left behind [s]
 # imports the main module before it calls its task.
 PROGRAM = textwrap.dedent(
     """
+    import multiprocessing
     import os
     import signal
     import threading
-    import time
 
-    from dpl.system.processes import die_with_parent, spawn_context
+    from dpl.system.processes import die_with_parent, workers_with
 
-    parent = int(os.environ.setdefault("PARENT", str(os.getpid())))
-    while __name__ == "__mp_main__" and {dies_first} and os.getppid() == parent:
-        time.sleep(0.01)
+    if __name__ == "__mp_main__" and {dies_first}:
+        multiprocessing.parent_process().join()
 
     def task():
         die_with_parent()
@@ -32,7 +31,7 @@ PROGRAM = textwrap.dedent(
         threading.Event().wait()
 
     if __name__ == "__main__":
-        spawn_context().Process(target=task, daemon=True).start()
+        workers_with("json").Process(target=task, daemon=True).start()
         if {dies_first}:
             os.kill(os.getpid(), signal.SIGKILL)
         threading.Event().wait()

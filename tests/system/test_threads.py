@@ -33,3 +33,8 @@ def test_one_thread_makes_all_calls_itself_if_they_are_few_or_it_is_alone(two_th
     with one_thread() if count >= 2 * FEWEST else contextlib.nullcontext():
         found = on_threads(lambda _: threading.get_ident(), range(count))
     assert found == [threading.get_ident()] * count
+
+
+def test_few_items_are_shared_by_the_threads_that_are_asked_for():
+    meeting = threading.Barrier(2, timeout=20)
+    assert sorted(on_threads(lambda _: meeting.wait(), range(2), 2)) == [0, 1]

@@ -99,7 +99,7 @@ def _without_tangents(scene: Scene, load: Load) -> Solution | None:
     *_, solution = solver.iterate(load, guess=guess)
     if not solution.converged:
         return None
-    value = linear.smallest_ritz_value(solution.displacement)
+    value = linear.smallest_ritz_value(solution.displacement, solution.internal)
     return solution if value > MIN_RITZ_VALUE else None
 
 

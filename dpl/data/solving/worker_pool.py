@@ -24,7 +24,7 @@ from typing import Any
 
 from dpl.data.solving.solve import LoadKey, SolvedLoad, failed_load, solve_load
 from dpl.scene import Scene
-from dpl.system.processes import block_signals, die_with_parent, spawn_context
+from dpl.system.processes import die_with_parent, workers_with
 
 MAX_RETRIES = 3  # tries of a load whose worker dies
 MAX_CONSECUTIVE_CRASHES = 12  # without a solved load in between; the loads are not the cause
@@ -128,11 +128,10 @@ class _Worker:
         self._start()
 
     def _start(self) -> None:
-        context = spawn_context()
+        context = workers_with(__name__)
         self.pipe, far_end = context.Pipe()
         process = context.Process(target=_work, args=(far_end,), daemon=True)
-        with block_signals(signal.SIGINT, signal.SIGTERM):
-            process.start()
+        process.start()
         far_end.close()
         self.process = process
         self.job: LoadKey | None = None

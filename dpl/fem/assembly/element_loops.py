@@ -235,26 +235,18 @@ def add_system(
 
 
 @njit(error_model="numpy", cache=True)
-def update_gap(law, gap, length, update, u, cells, reference, inverse, dV, psi):
-    """Return the gaps of strain and of volume after a step (N, D) to u (N, D), see `add_system`.
+def add_gap(gap, length, update, u, cells, reference, inverse, dV, psi):
+    """Add to the gaps of strain and of volume what a step (N, D) to u (N, D) changes nonlinearly.
 
-    `psi` are the functions of the volume change, (blocks or 1, Q, M, SIMD_WIDTH), or None.
-
-    They are (1 - length) gap plus what the step changes nonlinearly; that of the strain is
-    length^2 dH^T dH.
+    That of the strain is length^2 dH^T dH. For the gaps see `add_system`; `psi` are the functions
+    of the volume change, (blocks or 1, Q, M, SIMD_WIDTH), or None. No law is an argument: numba
+    would compile the loop for each.
     """
-    (numbers, _), (strain_gap, volume_gap) = cells, gap
-    blocks, n, Q, dim = len(numbers), numbers.shape[1], dV.shape[1], u.shape[1]
-    M = 0 if psi is None else psi.shape[2]
-    strains = np.zeros((blocks, Q, 6, SIMD_WIDTH))
-    volumes = np.zeros((blocks, M, SIMD_WIDTH))
-    if len(strain_gap) > 0:
-        strains += (1.0 - length) * strain_gap
-    if len(volume_gap) > 0:
-        volumes += (1.0 - length) * volume_gap
+    (numbers, _), (strains, volumes) = cells, gap
+    n, Q, dim = numbers.shape[1], dV.shape[1], u.shape[1]
     ue, G, H, F = rows(3 * n), rows(9 * Q), registers(9), registers(9)
     at, deformed = rows(3 * n), rows(9 * Q)
-    for block in range(blocks):
+    for block in range(len(numbers)):
         gather(update, numbers[block], dim, ue)
         slopes_of_cell(reference, ue, G)
         if psi is not None:
@@ -272,7 +264,6 @@ def update_gap(law, gap, length, update, u, cells, reference, inverse, dV, psi):
                 change = point.second_volume_change(F, H)
                 functions = psi[block if len(psi) > 1 else 0]
                 add_projected(weight * change, functions[q], volumes[block])
-    return strains, volumes
 
 
 @inlined

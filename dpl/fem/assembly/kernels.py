@@ -114,9 +114,16 @@ class Kernels:
 
     def gap_after(self, gap: Gap, length: float, update: Array, u: Array) -> Gap:
         """Return the gaps of the mixed integration points after a step (N, D) to u (N, D)."""
-        arguments = self._law[0], gap, length, update, u, *self._body, self.functions
-        found: Gap = call_compiled(element_loops.update_gap, *arguments)
-        return found
+        blocks, points = len(self.cells), self.dV.shape[1]
+        functions = 0 if self.functions is None else self.functions.shape[2]
+        shapes = (blocks, points, 6, SIMD_WIDTH), (blocks, functions, SIMD_WIDTH)
+        pairs = zip(gap, shapes, strict=True)
+        strains, volumes = (
+            (1 - length) * own if own.size else np.zeros(shape) for own, shape in pairs
+        )
+        arguments = (strains, volumes), length, update, u, *self._body, self.functions
+        call_compiled(element_loops.add_gap, *arguments)
+        return strains, volumes
 
 
 class CompiledLoops(NamedTuple):
@@ -200,19 +207,19 @@ def as_columns(values: Sequence[Any]) -> Array:
 PATIENCE = 2.0  # time after which a compilation is announced [s]
 COMPILING = "compiling element kernels for this law, once per machine ..."
 # kernels, laws and given arguments that this process has compiled or loaded
-_LOADED: set[tuple[Any, str, tuple[bool, ...]]] = set()
+_LOADED: set[tuple[Any, ...]] = set()
 
 
-def call_compiled(kernel: Any, law: Law, *arguments: Any) -> Any:
+def call_compiled(kernel: Any, *arguments: Any) -> Any:
     """Return the result of a kernel; lock numba's cache on disk at its first call.
 
     Two processes that save kernels of different laws at the same time would choose the same file
     name, and one law would then run the code of the other.
     """
-    given = tuple(argument is not None for argument in arguments)  # numba compiles for each
-    variant = (kernel, law.kind.name, given)
+    given = (a if isinstance(a, Law) else a is None for a in arguments)  # numba compiles for each
+    variant = (kernel, *given)
     if variant in _LOADED:
-        return kernel(law, *arguments)
+        return kernel(*arguments)
     with contextlib.ExitStack() as stack:
         # no lock on other systems, or in a read-only folder, where numba does not save
         with contextlib.suppress(ImportError, OSError):
@@ -227,7 +234,7 @@ def call_compiled(kernel: Any, law: Law, *arguments: Any) -> Any:
             timer.daemon = True
             timer.start()
             stack.callback(timer.cancel)
-        result = kernel(law, *arguments)
+        result = kernel(*arguments)
     _LOADED.add(variant)
     return result
 

@@ -15,10 +15,10 @@ from dpl.fem.materials.material import CompiledForm
 
 
 class _LawType(types.Type):
-    """Type of a law in numba, whose name holds a digest of the sources of law and kernels.
+    """Type of a law in numba, whose name is a digest of the sources of law and kernels.
 
-    A kernel is compiled once per law. After a change of the sources numba's cache on disk does not
-    return the old code.
+    A kernel is compiled once for all laws with the same sources. After a change of the sources
+    numba's cache on disk does not return the old code.
     """
 
 
@@ -50,8 +50,8 @@ def _law(parts: tuple[tuple[type[Any], int], ...], sources: str) -> Law:
     functions: list[Any] = [material.invariant_derivatives]
     functions += [kind.strain_derivatives for kind, _ in fibres]
     code = repr([_code_of(function) for function in functions]) + sources
-    digest = hashlib.sha256(code.encode()).hexdigest()[:16]
-    name = "".join(kind.__qualname__ for kind, _ in parts) + digest
+    code += repr([count for _, count in parts])  # of constants, whose places are compiled
+    name = f"Law{hashlib.sha256(code.encode()).hexdigest()[:16]}"
     if name not in _COMPILED:
         invariants, *compiled = map(_compile, functions)
         calls = [_call_of_fibres(compiled[0], range(at, at + count)) for _, count in fibres]

@@ -364,7 +364,8 @@ def solve_layers(blocks: Layers, right: Tensor) -> Tensor:
         own = own.flatten(1, 2).unflatten(1, layer.inverse.shape[1:3])  # (P, k, I, B)
         acting.append(own)
         if len(layer.boundary):
-            terms = (layer.coupling.mT @ own).flatten(1, 2)  # (P, k J, B)
+            # the attribute mT would be a second input of a loop in a graph, which may not be a view
+            terms = (layer.coupling.transpose(2, 3) @ own).flatten(1, 2)  # (P, k J, B)
             passed = torch.cat([passed, terms.unflatten(1, (-1, right.shape[2]))], dim=1)
     for layer, own in zip(reversed(blocks.layers), reversed(acting), strict=True):
         own = layer.inverse @ own

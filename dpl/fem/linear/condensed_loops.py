@@ -68,11 +68,15 @@ def condensed_solves(table, unknowns, values, factors, forces, solutions):  # ty
 
     The forces are overwritten. See `Condensed` for the other arguments.
     """
-    most = wide((table[:, 2] - table[:, 0]).max())
+    most = 0  # numba compiles the methods of arrays for a second
+    for s in range(len(table)):
+        most = max(most, wide(table[s, 2] - table[s, 0]))
     own, row = np.empty(most, forces.dtype), np.empty(most, forces.dtype)
     for p in range(len(values)):
-        force, solution = forces[p], solutions[p]
-        if not force.any():
+        force, solution, is_loaded = forces[p], solutions[p], False
+        for i in range(len(force)):
+            is_loaded |= force[i] != 0.0
+        if not is_loaded:
             solution[:] = 0.0
             continue
         of_inverse, of_coupling, columns = factors[p, 0], factors[p, 1], factors[p, 2]

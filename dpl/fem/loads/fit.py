@@ -64,7 +64,7 @@ def _fitted(rows, products, axes, inverse):  # type: ignore[no-untyped-def]
     The normal equations are solved by eigenvectors and inverse eigenvalues, (K, K) and (K,).
     """
     K, size = len(axes), np.sqrt(products[-1, -1])
-    q, right, rest = np.zeros(K), products[:-1, -1].copy(), rows[-1].copy()
+    q, right = np.zeros(K), products[:-1, -1].copy()
     for _ in range(2):  # the second time removes the rounding error of the normal equations
         for j in range(K):
             along = 0.0
@@ -72,7 +72,7 @@ def _fitted(rows, products, axes, inverse):  # type: ignore[no-untyped-def]
                 along += axes[k, j] * right[k]
             for k in range(K):
                 q[k] += inverse[j] * along * axes[k, j]
-        rest[:] = rows[-1]
+        rest = rows[-1].copy()
         for k in range(K):
             rest -= q[k] * rows[k]
         for k in range(K):

@@ -73,21 +73,21 @@ class LinearSolver:
         small = (k for k, step in enumerate(steps) if np.linalg.norm(step.residual) <= enough)
         return next(small, MAX_COUNT)
 
-    def smallest_ritz_value(self, displacement: Tensor) -> float:
+    def smallest_ritz_value(self, displacement: Tensor, internal: Tensor | None = None) -> float:
         """Return the smallest Ritz value of the corotated inverse times K(u), u (1, N, D) [-].
 
-        Differences of f_int replace products with K(u), whose assembly takes as long as eight of
-        them.
+        `internal` is the internal force f_int at u, (1, N, D), if known. Differences of f_int
+        replace products with K(u), whose assembly takes as long as eight of them.
         """
         problem, apply = self.problem, self.corotational.at(displacement).apply
         if not problem.has_potential:  # K is the symmetric part of the derivative of f_int
             return smallest_ritz_value(*self._preconditioned(displacement), problem.pattern.size)
-        internal = problem.evaluate(displacement).internal[0]
+        rest = (problem.evaluate(displacement).internal if internal is None else internal)[0]
 
         def product(x: Array) -> Array:
             step = DIFFERENCE / float(np.abs(x).max())
             moved = problem.evaluate(displacement + step * problem.extend(x)).internal[0]
-            return problem.restrict(moved - internal) / step
+            return problem.restrict(moved - rest) / step
 
         return smallest_ritz_value(product, apply, problem.pattern.size)
 

@@ -62,10 +62,12 @@ def split_field(characters, dofs, scales, field, support, parts):  # type: ignor
             if size > largest:
                 largest = size
     unit = largest if largest > 0 else 1.0
-    for p in range(len(dofs)):
-        whole[:] = -support[p]
+    for p in range(len(dofs)):  # numba compiles the assignment of an array for two seconds
+        for j in range(len(whole)):
+            whole[j] = -support[p, j]
         add_product(characters[p], own, whole)
-        parts[p] = whole / unit
+        for j in range(len(whole)):
+            parts[p, j] = whole[j] / unit
     return unit
 
 

@@ -10,6 +10,7 @@ from dpl.fem.rom.pod import orthonormal_fields
 from dpl.models.unrolled.fit import sample_weights
 from dpl.models.unrolled.regression import fit_gains
 from dpl.scene import Sample
+from dpl.system.threads import one_thread
 
 RANKS = (60, 100, 160)  # numbers of modes that are tried, and all modes
 CANDIDATES = 600  # cells to choose from
@@ -109,26 +110,26 @@ def choose_newton(
             problem, vectors[..., :rank], some, tolerance=tolerance, candidates=candidates
         )
 
-    def errors(found: SubspaceNewton, steps: int) -> Tensor:
-        return relative_errors(few, _corrected(found, few, guesses[:LOADS], steps))
+    def errors(found: SubspaceNewton) -> list[Tensor]:
+        return [relative_errors(few, u) for u in _corrected(found, few, guesses[:LOADS])]
 
     coarse, fine = TOLERANCES
     ranks = [*(rank for rank in RANKS if rank < vectors.shape[2]), vectors.shape[2]]
     best = solver(ranks[0], coarse)
-    error, most = (errors(best, steps) for steps in (1, MAX_STEPS))
+    error, most = errors(best)
     for rank in ranks[1:]:
         if rank > RANKS[1] and most.max() < SUFFICIENT:
             break
         found = solver(rank, coarse)
-        own, left = (errors(found, steps) for steps in (1, MAX_STEPS))
+        own, left = errors(found)
         falls = most.max() >= SUFFICIENT and left.max() < most.max()
         if falls or own.mean() < WORTH * error.mean():
             best, error, most = found, own, left
     if best.vectors.shape[2] != RANKS[1]:  # with more cells a step takes as long as in 100 modes
         finer = solver(best.vectors.shape[2], fine)
-        best = finer if errors(finer, 1).mean() < WORTH * error.mean() else best
+        best = finer if errors(finer)[0].mean() < WORTH * error.mean() else best
     best = with_gains(best, parity[: best.vectors.shape[2]], samples, predicted)
-    return best, errors(best, MAX_STEPS)
+    return best, errors(best)[1]
 
 
 def with_gains(
@@ -139,19 +140,23 @@ def with_gains(
     They map the first step to the errors in the modes that `MAX_STEPS` steps leave.
     """
     truth, basis = samples.displacement[: len(guesses)], solver.vectors.flatten(0, 1)
-    first, last = (_corrected(solver, samples, guesses, steps) for steps in (1, MAX_STEPS))
+    first, last = _corrected(solver, samples, guesses)
     steps, rest = (first - guesses).flatten(1) @ basis, (truth - last).flatten(1) @ basis
     gains = fit_gains(steps, rest, sample_weights(truth.flatten(1)), parity)
     return replace(solver, gains=gains)
 
 
-def _corrected(solver: SubspaceNewton, samples: Sample, guesses: Tensor, steps: int) -> Tensor:
-    """Return displacements (S, N, D) of the first samples after some steps from guesses."""
+def _corrected(solver: SubspaceNewton, samples: Sample, guesses: Tensor) -> tuple[Tensor, Tensor]:
+    """Return displacements (S, N, D) of the first samples after one and after `MAX_STEPS` steps."""
     found = []
-    for load, guess in zip(samples.load.unbatch(), guesses.split(1), strict=False):
-        *_, last = solver.states(load, guess=guess, max_iter=steps, error_tol=ERROR)
-        found.append(last.displacement)
-    return torch.cat(found)
+    with one_thread():
+        for load, guess in zip(samples.load.unbatch(), guesses.split(1), strict=False):
+            states = list(solver.states(load, guess=guess, max_iter=MAX_STEPS, error_tol=ERROR))
+            # the guess, too, may be the best state after one step
+            one = min(states[:2], key=lambda state: state.error)
+            found.append((one.displacement, states[-1].displacement))
+    first, last = map(torch.cat, zip(*found, strict=True))
+    return first, last
 
 
 def relative_errors(samples: Sample, displacement: Tensor) -> Tensor:

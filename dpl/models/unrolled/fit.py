@@ -17,6 +17,7 @@ from dpl.models.linear_response import LinearResponse
 from dpl.models.unrolled.features import SampleCells, cell_gradients, mechanical_maps
 from dpl.models.unrolled.regression import MapParities, fit_map, weighted_error
 from dpl.scene import Sample
+from dpl.system.threads import one_thread
 
 CHUNK = 256  # samples whose fields are computed at a time
 FEW = 16  # samples whose features are computed at a time, in the caches of a processor
@@ -177,6 +178,7 @@ def maps_at_cells(
     *,
     copies: int,
     stages: int,
+    threads: int,
 ) -> tuple[Maps, list[Tensor]]:
     """Fit maps one after the other, as long as the held-out error decreases enough.
 
@@ -195,7 +197,7 @@ def maps_at_cells(
         pairs = zip(sets, present, strict=True)
         rows, unseen = (_features(law, cells, part, c if k else None) for part, c in pairs)
         targets, prior = fitted.target - present[0], priors[min(k, 1)]
-        matrix, left_out = fit_map(rows, targets, fitted.weights, symmetry, prior, copies)
+        matrix, left_out = fit_map(rows, targets, fitted.weights, symmetry, prior, copies, threads)
         matrix = matrix.float().double()
         usual, proposed = (part.flatten(1) @ matrix for part in (rows, unseen))
         reached = weighted_error(held.target - present[1] - proposed, held.weights)
@@ -239,6 +241,7 @@ def fit_maps(
     copies: int,
     cells: int,
     stages: int,
+    threads: int,
 ) -> tuple[dict[str, Tensor], list[Tensor]]:
     """Return buffers of the maps at sample cells, and what they miss, see `maps_at_cells`.
 
@@ -247,7 +250,7 @@ def fit_maps(
         body: The body with the law that is sampled.
         in_modes: V, (n, R), the parity of each mode, (R,), and (V^T K(0) V)^-1 of `body`, (R, R).
         sets: Samples to fit to, and to choose by.
-        copies: Number of images of each sample in the first set, see `fit_map`.
+        copies, threads: Images of each sample in the first set, and threads, see `fit_map`.
         cells, stages: Numbers of sample cells, and largest number of maps after the first.
     """
     problem, parities = linear.scene.problem, linear.form.parities
@@ -265,7 +268,7 @@ def fit_maps(
     sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
     law = body.material.of_cells(numbers).centred()
     priors = mechanical_maps(body, numbers, sample_cells.gradients[:-1], inverse)
-    options = {"copies": copies, "stages": stages}
+    options = {"copies": copies, "stages": stages, "threads": threads}
     maps, missed = maps_at_cells(law, sample_cells, symmetry, priors, sets, **options)
     first, *others = (one.float() for one in maps.matrices)
     buffers = {
@@ -293,47 +296,49 @@ def fit_in_best_modes(
         error of held-out samples; all modes, (n, R), and their parities, (R,); and predictions
         (S, N, D) of the first `STEPPED` samples by maps that are fitted to the other samples.
     """
-    free = linear.scene.problem.free
-    rests = [
-        torch.cat([u[:, free] - linear(f[:, free], own) for f, u, _, own in _chunks(part)])
-        for part in both
-    ]
-    weights = sample_weights(both[0].displacement[:, free])
-    every, parity = modes_of_parity(linear, weights[:, None] * rests[0], rank)
-    inverses = [symmetry.inverse for symmetry in linear.group.coset_representatives()]
-    few = inverses[: max(1, MAX_ROWS // len(rests[0]))]
-    turned = [_image(every.T, one, free).T for one in few]
-    factors = terms.factors(terms.problem.reference.material)
+    threads = torch.get_num_threads()
+    with one_thread():  # threads of small operations wait for each other
+        free = linear.scene.problem.free
+        rests = [
+            torch.cat([u[:, free] - linear(f[:, free], own) for f, u, _, own in _chunks(part)])
+            for part in both
+        ]
+        weights = sample_weights(both[0].displacement[:, free])
+        every, parity = modes_of_parity(linear, weights[:, None] * rests[0], rank)
+        inverses = [symmetry.inverse for symmetry in linear.group.coset_representatives()]
+        few = inverses[: max(1, MAX_ROWS // len(rests[0]))]
+        turned = [_image(every.T, one, free).T for one in few]
+        factors = terms.factors(terms.problem.reference.material)
 
-    def fit(count: int, cells: int) -> tuple[float, dict[str, Tensor], Tensor, float]:
-        modes = every[:, :count]
-        stiffness = ReducedStiffness(reduced_terms(terms, modes), terms)
-        # coordinates of images of the samples are those of the samples in images of the modes
-        copies = (one[:, :count] for one in turned)
-        fitted = _joined(in_coordinates(terms, V, stiffness, both[0], rests[0]) for V in copies)
-        held = in_coordinates(terms, modes, stiffness, both[1], rests[1])
-        inverse = torch.from_numpy(stiffness.inverse(factors)[0])
-        options = {"copies": len(turned), "cells": cells, "stages": stages}
-        in_modes, sets = (modes, parity[:count], inverse), (fitted, held)
-        found, missed = fit_maps(linear, terms.problem, in_modes, sets, **options)
-        outside = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)
-        inside = missed[1].square().sum(dim=1)
-        squares = inside, inside + outside.clamp(min=0)
-        inner, error = (float((square.sqrt() * held.weights).mean()) for square in squares)
-        own = {"modes": modes.float(), "parity": parity[:count], "stiffness": stiffness.parts}
-        few = slice(min(STEPPED, len(rests[0])))  # the samples without their images
-        left_out = rests[0][few] + (missed[0] - fitted.target)[few] @ modes.T
-        return error, own | found, left_out, inner / max(error, 1e-300)
+        def fit(count: int, cells: int) -> tuple[float, dict[str, Tensor], Tensor, float]:
+            modes = every[:, :count]
+            stiffness = ReducedStiffness(reduced_terms(terms, modes), terms)
+            # coordinates of images of the samples are those of the samples in images of the modes
+            copies = (one[:, :count] for one in turned)
+            fitted = _joined(in_coordinates(terms, V, stiffness, both[0], rests[0]) for V in copies)
+            held = in_coordinates(terms, modes, stiffness, both[1], rests[1])
+            inverse = torch.from_numpy(stiffness.inverse(factors)[0])
+            options = {"copies": len(turned), "cells": cells, "stages": stages, "threads": threads}
+            in_modes, sets = (modes, parity[:count], inverse), (fitted, held)
+            found, missed = fit_maps(linear, terms.problem, in_modes, sets, **options)
+            outside = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)
+            inside = missed[1].square().sum(dim=1)
+            squares = inside, inside + outside.clamp(min=0)
+            inner, error = (float((square.sqrt() * held.weights).mean()) for square in squares)
+            own = {"modes": modes.float(), "parity": parity[:count], "stiffness": stiffness.parts}
+            few = slice(min(STEPPED, len(rests[0])))  # the samples without their images
+            left_out = rests[0][few] + (missed[0] - fitted.target)[few] @ modes.T
+            return error, own | found, left_out, inner / max(error, 1e-300)
 
-    counts = [every.shape[1]]
-    while counts[0] // 2 >= MIN_RANK:
-        counts.insert(0, counts[0] // 2)
-    best = fit(counts[0], cells)
-    while cells > 1 and (other := fit(counts[0], cells // 2))[0] < best[0]:
-        best, cells = other, cells // 2
-    for count in counts[1:]:
-        if best[3] > INSIDE or not (other := fit(count, cells))[0] < best[0]:
-            break
-        best = other
-    predicted = both[0].displacement[:STEPPED] - scatter_fields(best[2], free)
-    return best[1], (every, parity), predicted
+        counts = [every.shape[1]]
+        while counts[0] // 2 >= MIN_RANK:
+            counts.insert(0, counts[0] // 2)
+        best = fit(counts[0], cells)
+        while cells > 1 and (other := fit(counts[0], cells // 2))[0] < best[0]:
+            best, cells = other, cells // 2
+        for count in counts[1:]:
+            if best[3] > INSIDE or not (other := fit(count, cells))[0] < best[0]:
+                break
+            best = other
+        predicted = both[0].displacement[:STEPPED] - scatter_fields(best[2], free)
+        return best[1], (every, parity), predicted

@@ -119,7 +119,8 @@ def set_gradients(model, coordinates, parts, H):
     """Set H (M, b) at all images of the sample cells; `parts` (M, b) is work."""
     parts[:] = 0.0
     add_fields(model.columns, coordinates, model.gradients, parts)
-    H[:] = model.rest
+    H[:] = 0.0  # numba compiles the assignment of an array for three seconds
+    H += model.rest
     join(model.orbits.characters, model.entry_signs, parts, H)
 
 

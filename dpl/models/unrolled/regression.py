@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dpl.fem.parity import Parities, SignedOrbits
+from dpl.system.threads import on_threads
 
 RIDGES = tuple(10.0**-k for k in range(16, 2, -1))  # relative to the mean square [-]
 GAIN_RIDGES = tuple(10.0**k for k in range(-6, 3))  # the same, of gains of a step
@@ -50,6 +52,7 @@ def fit_map(
     symmetry: MapParities,
     prior: Tensor,
     images: int = 1,
+    threads: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """Return the linear map (C F D D, R) from features to targets, and left-out errors (S, R).
 
@@ -72,6 +75,7 @@ def fit_map(
         symmetry: Parities of features and targets.
         prior: Map that the ridge shrinks to, (C F D D, R).
         images: Number of rows of each sample, its images; row k S / images + s belongs to sample s.
+        threads: Number of threads that decompose the regressions of the parities.
 
     Raises:
         ValueError: The rows are not finite.
@@ -81,15 +85,16 @@ def fit_map(
     rest = targets - features @ prior
     if not (features.isfinite().all() and rest.isfinite().all()):
         raise ValueError("the samples are not finite")
-    blocks = []
-    for p, characters in enumerate(symmetry.parities.characters):
-        own = symmetry.coordinates == p
-        X = weights * orbits.coordinates(features, characters)
-        block = _decomposed(X, weights * rest[:, own])
-        blocks.append((own, characters, block))
-    ridge = _best_ridge([block for *_, block in blocks], RIDGES, images)
+    masks = [symmetry.coordinates == p for p in range(len(symmetry.parities.characters))]
+
+    def decomposed(p: int) -> _Decomposed:
+        X = weights * orbits.coordinates(features, symmetry.parities.characters[p])
+        return _decomposed(X, weights * rest[:, masks[p]])
+
+    blocks = on_threads(decomposed, range(len(masks)), threads)
+    ridge = _best_ridge(blocks, RIDGES, images)
     matrix, left_out = torch.zeros_like(prior), torch.empty_like(rest)
-    for own, characters, block in blocks:
+    for own, characters, block in zip(masks, symmetry.parities.characters, blocks, strict=True):
         change = block.basis @ _solved(block, ridge)[0]
         matrix[:, own] = prior[:, own] + orbits.fields(change.T, characters, len(prior)).T
         left_out[:, own] = _left_out(block, ridge, images, len(rest))[0]
@@ -133,7 +138,8 @@ def _decomposed(X: Tensor, Y: Tensor) -> _Decomposed:
     factors = torch.where(size > ROUNDING * size.max(), 1 / size, 0.0)
     X = X * factors
     is_dual = len(X) <= X.shape[1]
-    values, Q = torch.linalg.eigh(X @ X.T if is_dual else X.T @ X)
+    rows = X.numpy() if is_dual else X.T.numpy()  # numpy uses the symmetry of the product
+    values, Q = map(torch.from_numpy, np.linalg.eigh(rows @ rows.T))
     basis = factors[:, None] * (X.T @ Q if is_dual else Q)
     values = values.clamp(min=0) / max(X.shape[1], 1)
     return _Decomposed(values, Q if is_dual else X @ Q, basis, Y, is_dual)
