@@ -1,32 +1,21 @@
 """The linear solution K(0)^-1 f of every load, by nested static condensation."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.linalg import norm
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import Function
 from torch.nn.functional import pad
 
 from dpl.fem import Load
-from dpl.fem.linear.condensation import (
-    Condensed,
-    condense,
-    condensed_layers,
-    condensed_solutions,
-    rounded,
-    run_length,
-    solve_layers,
-)
+from dpl.fem.linear.condensation import Condensed, condensed_layers, run_length, solve_layers
 from dpl.fem.linear.krylov import conjugate_gradients, conjugate_gradients_of_tensors
 from dpl.fem.materials.material import Material
-from dpl.fem.solvers.parity_factor import OrbitArrays, OrbitForm, TermMatrices, split_field
-from dpl.fem.solvers.stiffness_terms import StiffnessTerms
+from dpl.fem.solvers.parity_factor import CondensedBody, OrbitArrays, TermMatrices, split_field
 from dpl.fem.symmetry import SymmetryGroup
 from dpl.models.interface import full_precision
 from dpl.scene import Scene
@@ -35,7 +24,6 @@ from dpl.system.threads import on_threads
 Array = NDArray[np.float64]
 Parts = NDArray[Any]  # values by parity in the type of the blocks, (M, m)
 Solve = Callable[[Array], tuple[float, Parts, Parts]]  # see `LinearResponse.at`
-MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are rounded [-]
 FEW = 8  # loads that compiled loops solve faster than products of matrices do
 MAX_VALUES = 2**26  # of a batch that are computed at a time by tensor operations
 
@@ -61,53 +49,25 @@ class LinearResponse:
         Raises:
             ValueError: K(0) changes too much with the parameters, see `StiffnessTerms`.
         """
+        own = scene.linear.condensed  # of all symmetries, whose blocks the solvers use too
+        is_own = group is None or len(group) == len(scene.linear.symmetries)
         self.scene = scene
-        self.group = scene.linear.reference.symmetries if group is None else group
+        self.group = scene.linear.symmetries if group is None else group
+        self.body = own if is_own else CondensedBody.of(scene.problem, self.group)
+        self.terms, self.form = self.body.terms, self.body.form
         self.terms.require_few_steps()
         self._kept: dict[tuple[torch.device, str], list[Any]] = {}
 
     # ------------------------------------------------------------------ blocks
 
-    @cached_property
-    def terms(self) -> StiffnessTerms:
-        """Terms of K(0) of the body."""
-        problem = self.scene.problem
-        return StiffnessTerms.of(replace(problem, follower_loads=problem.follower_loads.constant))
-
-    @cached_property
-    def form(self) -> OrbitForm:
-        """Values of each orbit of degrees of freedom, by which K(0) is stored."""
-        return OrbitForm.of(self.scene.problem.reference, self.group)
-
-    @cached_property
+    @property
     def blocks(self) -> Condensed:
-        """Blocks of K bodies, one matrix for each of M parities, `rounded`.
-
-        They are float64 if the solutions of random forces, or of the moved supports, lose more than
-        `MAX_ROUNDING`.
-        """
-        bodies, points = self.terms.kept_bodies, self.form.points
-        matrices = [matrix for body in bodies for matrix in self.form.matrices(body)]
-        exact = condense(matrices, points)
-        supports = self._supports.numpy().reshape(len(self._supports), -1, len(points))
-        found = rounded(exact, np.tile(supports, (1, len(bodies), 1)))
-        moved = np.tensordot(np.append(self.terms.node[0].numpy(), 1.0), supports, 1)
-        random = np.random.default_rng(0).standard_normal((len(matrices), len(points)))
-        for forces in (random, np.tile(moved, (len(bodies), 1))):
-            one, other = (condensed_solutions(blocks, forces) for blocks in (found, exact))
-            if (norm(one - other, axis=1) > MAX_ROUNDING * norm(other, axis=1)).any():
-                return exact
-        return found
+        """Blocks of the body."""
+        return self.body.blocks
 
     @cached_property
     def _matrices(self) -> TermMatrices:
         return TermMatrices.of(self.terms, self.form)
-
-    @cached_property
-    def _supports(self) -> Tensor:
-        """Forces of `StiffnessTerms.support_forces` by parity, (T + 1, M m)."""
-        forces = self.terms.support_forces()[:, self.scene.problem.free.cpu()]
-        return torch.stack([self.form.parts(force).flatten() for force in forces])
 
     def dead_loads(self, force: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return loads without ranged follower loads: forces (B, N, D) and parameters of the law.
@@ -142,7 +102,7 @@ class LinearResponse:
         """
         factors = np.append(self.terms.factors(law)[0].numpy(), 1.0)
         inverse, (characters, dofs, _, scales) = self._inverse(factors), self.orbits
-        support = (factors @ self._supports.numpy()).reshape(dofs.shape)
+        support = (factors @ self.body.supports.numpy()).reshape(dofs.shape)
         dtype = self.blocks.dtype
 
         def solve(force: Array) -> tuple[float, Parts, Parts]:
@@ -154,28 +114,19 @@ class LinearResponse:
 
     def _inverse(self, factors: Array) -> Callable[[Parts], Parts]:
         """Return f -> K(0)^-1 f, (M, m) each, of factors and 1, (T + 1,); f is of order one."""
-        weights = self.terms.weights(torch.from_numpy(factors[None, :-1]))[0].numpy()
-        shape, dtype, used = self.orbits.dofs.shape, self.blocks.dtype, weights.nonzero()[0]
-        own = slice(used[0] * shape[0], (used[-1] + 1) * shape[0])
-        table, unknowns, heights, values, scales = self.blocks
-        blocks = Condensed(table, unknowns, heights, values[own], scales[own])
-        weights = weights[used, None, None].astype(dtype)
-
-        def interpolate(parts: Parts) -> Parts:
-            found = condensed_solutions(blocks, (weights * parts).reshape(-1, shape[1]))
-            return found.reshape(-1, *shape).sum(axis=0)
-
+        shape = self.orbits.dofs.shape
+        inverse = self.body.inverse(torch.from_numpy(factors[None, :-1])).apply
         if not self.terms.has_steps:
-            return interpolate
+            return inverse
         matrix, ends = self._matrices.at(factors), (self.terms.rtol, 2 * self.terms.bound)
 
         def precondition(residual: Array) -> Array:
-            return interpolate(residual.reshape(shape)).astype(np.float64).ravel()
+            return inverse(residual.reshape(shape)).astype(np.float64).ravel()
 
         def solve(parts: Parts) -> Parts:
             right = parts.astype(np.float64).ravel()
             found = conjugate_gradients(matrix.dot, precondition, right, *ends, natural=True)
-            return found.reshape(shape).astype(dtype)
+            return found.reshape(shape).astype(self.blocks.dtype)
 
         return solve
 
@@ -286,7 +237,7 @@ class LinearResponse:
             runs = dofs.flatten()[:: self._run] // self._run
             places = torch.full((self.scene.problem.free.numel() // self._run,), len(runs))
             places[runs] = torch.arange(len(runs))
-            own = runs, signs, scales, torch.from_numpy(characters), self._supports, places
+            own = runs, signs, scales, torch.from_numpy(characters), self.body.supports, places
             return [part.to(device) for part in own]
 
         return self._on(device, "orbits", make)

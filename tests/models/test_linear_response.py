@@ -9,6 +9,7 @@ from linear_solutions import BEAM, SUPPORTS, at_free, exact, relative
 from benchmarks.samples import solved
 from dpl import Scene, fem
 from dpl.fem import NeoHookeanLn
+from dpl.fem.solvers import parity_factor
 from dpl.models import FCNN, LinearResponse, Unrolled, linear_response
 from dpl.training import RMSELoss, Surrogate
 
@@ -144,7 +145,7 @@ def test_a_batch_is_solved_like_its_members(name, monkeypatch):
 def test_blocks_are_float64_where_rounded_ones_are_not_accurate_enough(monkeypatch):
     scene = scene_of(PLAIN)
     assert LinearResponse(scene, []).blocks.values.dtype == "int16"
-    monkeypatch.setattr(linear_response, "MAX_ROUNDING", 0.0)
+    monkeypatch.setattr(parity_factor, "MAX_ROUNDING", 0.0)
     response = LinearResponse(scene, [])
     force, none = forces(scene), parameters(scene)
     found = response(at_free(scene, force), none)

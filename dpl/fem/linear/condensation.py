@@ -248,15 +248,17 @@ def condensed_solutions(blocks: Condensed, forces: NDArray[Any]) -> NDArray[Any]
 
 
 def add_inverses(
-    blocks: Condensed, unknowns: Integers, signs: NDArray[np.float64], out: NDArray[np.float64]
-) -> Iterator[None]:
-    """Add S A^-1 S at k unknowns of each matrix A to `out` (k, k), in a step for each front.
+    blocks: Condensed, unknowns: Integers, signs: NDArray[np.float64],
+    weights: NDArray[np.float64], out: NDArray[np.float64],
+) -> Iterator[None]:  # fmt: skip
+    """Add w S A^-1 S at k unknowns of each matrix A to `out` (k, k), in a step for each front.
 
-    S is the diagonal of `signs`, (P, k). With A = L D L^T the inverse is (L^-1)^T D^-1 L^-1, so
-    that only the forward pass is made, for all columns at once and in the dtype of the blocks.
+    S is the diagonal of `signs`, (P, k), and w a weight of each matrix, (P,). With A = L D L^T the
+    inverse is (L^-1)^T D^-1 L^-1, so that only the forward pass is made, for all columns at once
+    and in the dtype of the blocks.
     """
     size = len(np.unique(blocks.unknowns))
-    for p, own in enumerate(signs):
+    for p, (own, weight) in enumerate(zip(signs, weights, strict=True)):
         forces = np.zeros((size, len(unknowns)), blocks.dtype)
         forces[unknowns, np.arange(len(unknowns))] = own
         for k, (first, middle, last, _) in enumerate(blocks.table.tolist()):
@@ -265,7 +267,7 @@ def add_inverses(
             if not len(acting):
                 continue
             right, (inverse, X) = forces[pivots[:, None], acting], blocks.front(p, k)
-            out[acting[:, None], acting] += right.T @ (inverse @ right)
+            out[acting[:, None], acting] += weight * (right.T @ (inverse @ right))
             forces[boundary[:, None], acting] -= X.T @ right
             yield
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import _lru_cache_wrapper, cached_property, lru_cache, partial
 from itertools import islice
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from dpl.fem.linear.interface import Array, Backend, Factor, SymmetricProduct
 from dpl.fem.linear.krylov import Map, krylov_steps, smallest_ritz_value
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotationalPreconditioner
-from dpl.fem.solvers.parity_factor import ParityFactor
+from dpl.fem.solvers.parity_factor import CondensedBody
 from dpl.fem.solvers.solution import Load, Solution, check_force, check_tol, evaluate_solution
 from dpl.fem.symmetry import SymmetryGroup, symmetries
 
@@ -98,22 +98,32 @@ class LinearSolver:
         return product, self.corotational.at(displacement).apply
 
     @cached_property
+    def condensed(self) -> CondensedBody:
+        """K(0)^-1 of the body for all parameters of its law."""
+        if self.parent:
+            return self.parent.condensed
+        return CondensedBody.of(self.problem, self.symmetries)
+
+    @cached_property
     def float32_factor(self) -> Factor:
-        """Approximate factor of K(0): accurate to 1e-6 to 1e-5, or in full if it is not banded.
+        """Approximate factor of K(0): accurate to 1e-4, or in full if it is not banded.
 
         Dense blocks of a nested condensation solve ten times as fast as bands. They take longer to
-        compute, so that other parameters than the reference have a banded factor.
+        compute: where those of a few parameters do not serve the others, these have bands.
         """
         if self._twin:
             return self._twin.float32_factor
         if self.approximate is not None:
             return self.approximate
-        factor = self.factor
-        if not isinstance(factor, BandedFactor):
-            return factor
-        is_reference = self.parent is None or self.problem is self.parent.problem.reference
-        if is_reference:
-            return ParityFactor.of(self.problem, self.symmetries)
+        reference = (self.parent or self).reference
+        if not isinstance(reference.factor, BandedFactor):
+            return self.factor
+        if not self.condensed.terms.has_steps:
+            return self.condensed.factor(self.problem.material)
+        if self.problem is reference.problem:
+            one = CondensedBody.of(self.problem, self.symmetries)
+            return one.factor(self.problem.material)
+        factor = cast(BandedFactor, self.factor)
         return replace(factor, storage=factor.storage.astype(np.float32))
 
     @property
@@ -184,8 +194,9 @@ class LinearSolver:
         return self.problem.extend(self.factor.solve(self.problem.restrict(force)))
 
     def __getstate__(self) -> dict[str, object]:
-        """Pickle without the factor."""
-        return {"problem": self.problem, "tol": self.tol, "linear": self.linear}
+        """Pickle without the factor, but with blocks of `condensed` that take long to compute."""
+        kept = ("problem", "tol", "linear", "condensed")
+        return {name: vars(self)[name] for name in kept if name in vars(self)}
 
 
 @runtime_checkable

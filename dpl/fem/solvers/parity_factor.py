@@ -6,8 +6,9 @@ fewer.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import NamedTuple, Self
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -26,11 +27,13 @@ from dpl.fem.linear.condensation import (
 )
 from dpl.fem.linear.condensed_loops import add_product
 from dpl.fem.linear.interface import Array, Factor, full_matrix
+from dpl.fem.materials.material import Material
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import SymmetryGroup
 
+MAX_ROUNDING = 1e-4  # relative error of solutions up to which blocks are rounded [-]
 VALUES = Typed(float64, 1, "A", readonly=True)
 TABLE = Typed(float64, 2, "C", readonly=True)
 INDICES = Typed(int64, 2, "C", readonly=True)
@@ -126,28 +129,104 @@ class OrbitForm(NamedTuple):
         return parts
 
 
-@dataclass(frozen=True, eq=False)
-class ParityFactor(Factor):
-    """Nested condensation of K(0) for one value of each of m orbits, M parities."""
+class Inverse(NamedTuple):
+    """K(0)^-1 of one law by parity: a weighted sum of the inverses of K bodies.
 
-    blocks: Condensed  # rounded blocks of the parities
-    orbits: OrbitArrays  # free degrees of freedom of each orbit
-    negative_pivots: int = 0
+    Attributes:
+        blocks: Blocks of K bodies, M parities each.
+        weights: Weights of the bodies, (K, 1, 1), of the type of the blocks.
+    """
+
+    blocks: Condensed
+    weights: NDArray[Any]
+
+    def apply(self, parts: NDArray[Any]) -> NDArray[Any]:
+        """Return the products with forces by parity, (M, m) each, in the type of the blocks."""
+        forces = (self.weights * parts).reshape(-1, parts.shape[1])
+        found = condensed_solutions(self.blocks, forces)
+        return found.reshape(-1, *parts.shape).sum(axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class CondensedBody:
+    """K(0)^-1 of a body for all parameters of its law, by blocks of a few bodies and parities.
+
+    The blocks are computed when they are first used.
+
+    Attributes:
+        terms: K(0) by its dependence on the parameters, and the bodies whose blocks are kept.
+        form: Values of each orbit of degrees of freedom, by which K(0) is stored.
+    """
+
+    terms: StiffnessTerms
+    form: OrbitForm
 
     @classmethod
     def of(cls, problem: Problem, group: SymmetryGroup) -> Self:
-        """Factorise K(0) of a body; raise a `SingularMatrix` if it is not positive definite."""
-        form = OrbitForm.of(problem, group)
-        blocks = rounded(condense(form.matrices(problem), form.points))
-        return cls(blocks, form.arrays(np.arange(problem.pattern.size)))
+        """Take a body, whose law may have ranges, and symmetries of it."""
+        loads = problem.follower_loads.constant
+        terms = StiffnessTerms.of(replace(problem, follower_loads=loads))
+        return cls(terms, OrbitForm.of(problem.reference, group))
+
+    @cached_property
+    def supports(self) -> Tensor:
+        """Forces of `StiffnessTerms.support_forces` by parity, (T + 1, M m)."""
+        forces = self.terms.support_forces()[:, self.terms.problem.free.cpu()]
+        return torch.stack([self.form.parts(force).flatten() for force in forces])
+
+    @cached_property
+    def blocks(self) -> Condensed:
+        """Blocks of K bodies, one matrix for each of M parities, `rounded`.
+
+        They are float64 if the solutions of random forces, or of the moved supports, lose more than
+        `MAX_ROUNDING`. Raises a `SingularMatrix` if K(0) is not positive definite.
+        """
+        bodies, points = self.terms.kept_bodies, self.form.points
+        matrices = [matrix for body in bodies for matrix in self.form.matrices(body)]
+        exact = condense(matrices, points)
+        supports = self.supports.numpy().reshape(len(self.supports), -1, len(points))
+        found = rounded(exact, np.tile(supports, (1, len(bodies), 1)))
+        moved = np.tensordot(np.append(self.terms.node[0].numpy(), 1.0), supports, 1)
+        random = np.random.default_rng(0).standard_normal((len(matrices), len(points)))
+        for forces in (random, np.tile(moved, (len(bodies), 1))):
+            one, other = (condensed_solutions(blocks, forces) for blocks in (found, exact))
+            loss, size = (np.linalg.norm(x, axis=1) for x in (one - other, other))
+            if (loss > MAX_ROUNDING * size).any():
+                return exact
+        return found
+
+    def inverse(self, factors: Tensor) -> Inverse:
+        """Return K(0)^-1 of factors (1, T) of the terms, or that of the node if it needs steps."""
+        weights = self.terms.weights(factors)[0].numpy()
+        used, count = weights.nonzero()[0], len(self.form.parities.characters)
+        own = slice(used[0] * count, (used[-1] + 1) * count)
+        table, unknowns, heights, values, scales = self.blocks
+        blocks = Condensed(table, unknowns, heights, values[own], scales[own])
+        return Inverse(blocks, weights[used, None, None].astype(blocks.dtype))
+
+    def factor(self, law: Material) -> "ParityFactor":
+        """Return the factor of K(0) of a law without ranges, which needs no steps."""
+        return ParityFactor(self.inverse(self.terms.factors(law)), self._orbits)
+
+    @cached_property
+    def _orbits(self) -> OrbitArrays:
+        return self.form.arrays(np.arange(self.terms.problem.pattern.size))
+
+
+@dataclass(frozen=True, eq=False)
+class ParityFactor(Factor):
+    """Factor of K(0) by nested condensation, for one value of each of m orbits, M parities."""
+
+    inverse: Inverse
+    orbits: OrbitArrays  # free degrees of freedom of each orbit
+    negative_pivots: int = 0
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
-        """Return x, (n,), with K x = right, in the accuracy of the rounded blocks."""
+        """Return x, (n,), with K x = right, in the accuracy of the blocks."""
         characters, dofs, signs, scales = self.orbits
-        parts, x = np.empty(dofs.shape, np.float32), np.empty_like(right)
+        parts, x = np.empty(dofs.shape, self.inverse.blocks.dtype), np.empty_like(right)
         unit = split_field(characters, dofs, scales, right, np.zeros(dofs.shape), parts)
-        solved = condensed_solutions(self.blocks, parts)
-        join_field(characters, dofs, signs, solved, unit, x)
+        join_field(characters, dofs, signs, self.inverse.apply(parts), unit, x)
         return x
 
     def compliance_steps(
@@ -159,7 +238,9 @@ class ParityFactor(Factor):
         found = order[np.searchsorted(dofs.ravel()[order], places)]
         orbit = found % dofs.shape[1]  # of the values at the places
         own = np.where(dofs[:, orbit] == places, scales[:, orbit], 0.0)  # (M, k)
-        return add_inverses(self.blocks, orbit, characters @ own, out)
+        (blocks, weights), signs = self.inverse, characters @ own
+        signs = np.tile(signs, (len(weights), 1))
+        return add_inverses(blocks, orbit, signs, np.repeat(weights.ravel(), len(own)), out)
 
 
 class TermMatrices(NamedTuple):
