@@ -191,7 +191,8 @@ class LinearResponse:
 
     def by_tensors(self, right: Tensor, factors: Tensor) -> Tensor:
         """Return the same as `solve` by tensor operations."""
-        layers, columns, entries = self.tensors(right.device)
+        (layers,) = self.tensors(right.device)
+        columns, entries = self.matrix(right.device) if self.terms.has_steps else (right[:0],) * 2
         count = max(1, MAX_VALUES // max(columns.numel(), self.blocks.values.size))
         if not torch.compiler.is_compiling() and right.shape[0] > count:
             both = zip(right.split(count), factors.split(count), strict=True)
@@ -243,13 +244,12 @@ class LinearResponse:
         return self._on(device, "orbits", make)
 
     def tensors(self, device: torch.device) -> list[Any]:
-        """Return `condensed_layers`, and columns and entries of `TermMatrices.padded`."""
+        """Return `condensed_layers`."""
+        return self._on(device, "blocks", lambda: [condensed_layers(self.blocks, device)])
 
-        def make() -> list[Any]:
-            terms = self._matrices.padded() if self.terms.varies else (torch.zeros(0).long(),) * 2
-            return [condensed_layers(self.blocks, device), *(part.to(device) for part in terms)]
-
-        return self._on(device, "blocks", make)
+    def matrix(self, device: torch.device) -> list[Tensor]:
+        """Return columns and entries of `TermMatrices.padded`."""
+        return self._on(device, "matrix", lambda: [x.to(device) for x in self._matrices.padded()])
 
     def _on(self, device: torch.device, name: str, make: Callable[[], list[Any]]) -> list[Any]:
         """Return tensors, kept for a device unless a graph is traced, whose tensors lack values."""
@@ -275,7 +275,7 @@ class _Solve(Function):
         right: Tensor = _Solve.apply(gradients[0], factors, ctx.response)
         of_factors = None
         if ctx.needs_input_grad[1] and ctx.response.terms.varies:
-            _, columns, entries = ctx.response.tensors(x.device)
+            columns, entries = ctx.response.matrix(x.device)
             of_factors = -torch.einsum("bn,bnw,knw->bk", right, x[:, columns], entries)
         return right, of_factors, None
 

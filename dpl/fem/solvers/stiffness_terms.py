@@ -174,7 +174,7 @@ class StiffnessTerms:
     def weights(self, factors: Tensor) -> Tensor:
         """Return weights of the inverses of `kept_bodies`, (B, K), for factors (B, T)."""
         if self.interpolation is None:
-            return factors.new_ones(len(factors), 1)
+            return factors.new_ones(factors.shape[0], 1)
         return self.interpolation.weights(factors)
 
     @cached_property
