@@ -228,7 +228,7 @@ KEYS = ((float, "minutes", 1e-2, 1e6), (Sequence[Literal["training", "simulator"
 RECORDS = 360  # of each workload
 
 
-@cli.command("soak", conf=CONF, keys=KEYS)
+@cli.command("soak", conf=CONF, keys=KEYS, preload=["dpl.data.solving.worker_pool"])
 def main(cfg: DictConfig) -> None:
     """Train, simulate and record the resources of both."""
     if not cfg.workloads:

@@ -111,6 +111,7 @@ def read_shard(
         if shape is not None and not flaw and stored != digest(path.name, columns):
             flaw = "the SHA-256 of its name and its columns is wrong"
     except (SafetensorError, KeyError, TypeError, RuntimeError) as error:
+        path.stat()  # raises a FileNotFoundError if it has been removed meanwhile
         flaw = str(error)
     if flaw:
         raise ValueError(f"is damaged: {flaw}")
