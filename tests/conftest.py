@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -186,6 +187,22 @@ def _environment(threads: int = THREADS) -> dict[str, str]:
 def members() -> Callable[[int], list[int]]:
     """Lists the living processes of a process group."""
     return _members
+
+
+@pytest.fixture(scope="session")
+def workers_of() -> Callable[[int], list[int]]:
+    """Lists the living worker processes of a process group: children of their server."""
+
+    def workers(group: int) -> list[int]:
+        parents = {}
+        for pid in _members(group):
+            with suppress(OSError):  # it has just ended
+                if "forkserver" in Path(f"/proc/{pid}/cmdline").read_text():
+                    stat = Path(f"/proc/{pid}/stat").read_text()
+                    parents[pid] = int(stat.rpartition(")")[2].split()[1])
+        return [pid for pid, parent in parents.items() if parent in parents]
+
+    return workers
 
 
 def _members(group: int) -> list[int]:

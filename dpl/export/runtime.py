@@ -128,7 +128,7 @@ def _model(net: Unrolled) -> Arrays:
     return {
         **orbits._asdict(),
         "dofs": orbits.dofs.astype(np.int32),
-        "supports": (factors @ linear.body.supports.numpy()).reshape(orbits.dofs.shape),
+        "supports": (factors @ linear.condensed.supports.numpy()).reshape(orbits.dofs.shape),
         **own,
         "columns": arrays.columns.astype(np.int32),
         "reduced_inverse": inverse,

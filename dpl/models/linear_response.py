@@ -12,7 +12,13 @@ from torch.autograd import Function
 from torch.nn.functional import pad
 
 from dpl.fem import Load
-from dpl.fem.linear.condensation import Condensed, condensed_layers, run_length, solve_layers
+from dpl.fem.linear.condensation import (
+    Condensed,
+    Layers,
+    condensed_layers,
+    run_length,
+    solve_layers,
+)
 from dpl.fem.linear.krylov import conjugate_gradients, conjugate_gradients_of_tensors
 from dpl.fem.materials.material import Material
 from dpl.fem.solvers.parity_factor import CondensedBody, OrbitArrays, TermMatrices, split_field
@@ -53,8 +59,8 @@ class LinearResponse:
         is_own = group is None or len(group) == len(scene.linear.symmetries)
         self.scene = scene
         self.group = scene.linear.symmetries if group is None else group
-        self.body = own if is_own else CondensedBody.of(scene.problem, self.group)
-        self.terms, self.form = self.body.terms, self.body.form
+        self.condensed = own if is_own else CondensedBody.of(scene.problem, self.group)
+        self.terms, self.form = self.condensed.terms, self.condensed.form
         self.terms.require_few_steps()
         self._kept: dict[tuple[torch.device, str], list[Any]] = {}
 
@@ -63,7 +69,7 @@ class LinearResponse:
     @property
     def blocks(self) -> Condensed:
         """Blocks of the body."""
-        return self.body.blocks
+        return self.condensed.blocks
 
     @cached_property
     def _matrices(self) -> TermMatrices:
@@ -102,7 +108,7 @@ class LinearResponse:
         """
         factors = np.append(self.terms.factors(law)[0].numpy(), 1.0)
         inverse, (characters, dofs, _, scales) = self._inverse(factors), self.orbits
-        support = (factors @ self.body.supports.numpy()).reshape(dofs.shape)
+        support = (factors @ self.condensed.supports.numpy()).reshape(dofs.shape)
         dtype = self.blocks.dtype
 
         def solve(force: Array) -> tuple[float, Parts, Parts]:
@@ -115,7 +121,7 @@ class LinearResponse:
     def _inverse(self, factors: Array) -> Callable[[Parts], Parts]:
         """Return f -> K(0)^-1 f, (M, m) each, of factors and 1, (T + 1,); f is of order one."""
         shape = self.orbits.dofs.shape
-        inverse = self.body.inverse(torch.from_numpy(factors[None, :-1])).apply
+        inverse = self.condensed.inverse(torch.from_numpy(factors[None, :-1])).apply
         if not self.terms.has_steps:
             return inverse
         matrix, ends = self._matrices.at(factors), (self.terms.rtol, 2 * self.terms.bound)
@@ -191,7 +197,7 @@ class LinearResponse:
 
     def by_tensors(self, right: Tensor, factors: Tensor) -> Tensor:
         """Return the same as `solve` by tensor operations."""
-        (layers,) = self.tensors(right.device)
+        (layers,) = self.layers(right.device)
         columns, entries = self.matrix(right.device) if self.terms.has_steps else (right[:0],) * 2
         count = max(1, MAX_VALUES // max(columns.numel(), self.blocks.values.size))
         if not torch.compiler.is_compiling() and right.shape[0] > count:
@@ -238,13 +244,13 @@ class LinearResponse:
             runs = dofs.flatten()[:: self._run] // self._run
             places = torch.full((self.scene.problem.free.numel() // self._run,), len(runs))
             places[runs] = torch.arange(len(runs))
-            own = runs, signs, scales, torch.from_numpy(characters), self.body.supports, places
+            own = runs, signs, scales, torch.from_numpy(characters), self.condensed.supports, places
             return [part.to(device) for part in own]
 
         return self._on(device, "orbits", make)
 
-    def tensors(self, device: torch.device) -> list[Any]:
-        """Return `condensed_layers`."""
+    def layers(self, device: torch.device) -> list[Layers]:
+        """Return `condensed_layers`, one member."""
         return self._on(device, "blocks", lambda: [condensed_layers(self.blocks, device)])
 
     def matrix(self, device: torch.device) -> list[Tensor]:

@@ -5,8 +5,7 @@ import os
 import shutil
 import signal
 import time
-from contextlib import suppress
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pytest
@@ -152,7 +151,7 @@ def test_training_on_a_stream_of_two_workers_ends_and_leaves_no_process(
 
 
 @pytest.fixture
-def streaming(start, members, tiny_training, tmp_path):
+def streaming(start, workers_of, tiny_training, tmp_path):
     """A run on an endless stream, with its checkpoints there; and its two workers."""
     overrides = online(tiny_training, "trainer.max_epochs=100000", "run=r")
     process = start("train", *overrides, cwd=tmp_path)
@@ -160,15 +159,7 @@ def streaming(start, members, tiny_training, tmp_path):
     assert there
     assert process.poll() is None, process.communicate()[1][-2000:]
 
-    def workers():
-        parents = {}  # of the workers and their server
-        for pid in members(process.pid):
-            with suppress(OSError):  # it has just ended
-                if "forkserver" in Path(f"/proc/{pid}/cmdline").read_text():
-                    stat = Path(f"/proc/{pid}/stat").read_text()
-                    parents[pid] = int(stat.rpartition(")")[2].split()[1])
-        return [pid for pid, parent in parents.items() if parent in parents]
-
+    workers = partial(workers_of, process.pid)
     assert len(workers()) == 2
     return process, workers
 

@@ -103,18 +103,6 @@ def waited_for(condition):
     return False
 
 
-def workers_of(members, group):
-    """Return the living worker processes of a process group, children of their server."""
-    parents = {}
-    for pid in members(group):
-        with suppress(OSError):  # it has just ended
-            if "forkserver" in Path(f"/proc/{pid}/cmdline").read_text():
-                parents[pid] = int(
-                    Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]
-                )
-    return [pid for pid, parent in parents.items() if parent in parents]
-
-
 def gone(members, group):
     """Wait until no process of a group is left; return whether none is."""
     return waited_for(lambda: not members(group))
@@ -158,10 +146,10 @@ def begun(folder):
 
 
 @pytest.mark.slow
-def test_workers_in_a_solve_end_with_a_killed_parent(start, members, slow, tmp_path):
+def test_workers_in_a_solve_end_with_a_killed_parent(start, members, workers_of, slow, tmp_path):
     process = start("generate", *slow(pause=-1, workers=1), cwd=tmp_path)
     assert waited_for(lambda: begun(tmp_path) == 1)
-    assert len(workers_of(members, process.pid)) == 1
+    assert len(workers_of(process.pid)) == 1
     process.kill()
     process.wait()
     assert gone(members, process.pid)
@@ -170,7 +158,7 @@ def test_workers_in_a_solve_end_with_a_killed_parent(start, members, slow, tmp_p
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_twenty_killed_runs_and_a_resume_make_the_bytes_of_one_run(
-    start, members, script, slow, tmp_path
+    start, members, workers_of, script, slow, tmp_path
 ):
     sizes = {"train": 260, "val": 20, "test": 20}
     made(script, slow(**sizes, folder="once"), tmp_path)
@@ -184,7 +172,7 @@ def test_twenty_killed_runs_and_a_resume_make_the_bytes_of_one_run(
         if cycle % 4:  # most of them amid work, the others as soon as there are workers
             waited_for(lambda: done(folder) >= before + more or process.poll() == 0)
         else:
-            waited_for(lambda: workers_of(members, process.pid) or process.poll() == 0)
+            waited_for(lambda: workers_of(process.pid) or process.poll() == 0)
         amid = process.poll() is None and done(folder) != before
         process.kill()
         process.wait()
@@ -230,13 +218,13 @@ def test_after_one_signal_the_solves_in_progress_are_finished_and_kept(
     assert content(tmp_path / "d") == content(tmp_path / "once")
 
 
-def test_a_second_signal_aborts_the_solves_in_progress(start, members, slow, tmp_path):
+def test_a_second_signal_aborts_the_solves_in_progress(start, members, workers_of, slow, tmp_path):
     process = start("generate", *slow(pause=-1, workers=1), cwd=tmp_path)
     assert waited_for(lambda: begun(tmp_path) == 1)
     os.killpg(process.pid, signal.SIGINT)
     said = read_until_confirmed(process)
     assert process.poll() is None, "the solves in progress continue"
-    assert len(workers_of(members, process.pid)) == 1
+    assert len(workers_of(process.pid)) == 1
     os.killpg(process.pid, signal.SIGINT)
     status, _, err = finish(process)  # the solves in progress would never end
     assert status == 130, err[-2000:]
@@ -247,11 +235,11 @@ def test_a_second_signal_aborts_the_solves_in_progress(start, members, slow, tmp
 
 @pytest.mark.slow
 def test_an_interrupt_during_the_start_of_workers_prints_no_traceback(
-    start, members, slow, tmp_path
+    start, members, workers_of, slow, tmp_path
 ):
     """A terminal also sends Ctrl-C to workers, possibly before they set their handlers."""
     process = start("generate", *slow(pause=0.2, train=20), cwd=tmp_path)
-    assert waited_for(lambda: len(workers_of(members, process.pid)) == 2)
+    assert waited_for(lambda: len(workers_of(process.pid)) == 2)
     os.killpg(process.pid, signal.SIGINT)
     status, _, err = finish(process)
     assert status == 130, err[-2000:]

@@ -70,6 +70,7 @@ def test_a_notebook_links_to_what_is_there(path):
         assert (path.parent / target).is_file()
 
 
+FIGURES = {"8_other_solvers": 2}  # fewest of a notebook; 5 of the others
 # the one of the fewest laws, whose loops have to be compiled where no test has run before
 QUICK = next(path for path in NOTEBOOKS if path.stem == "2_loads_and_data")
 
@@ -95,7 +96,7 @@ def test_a_notebook_runs_and_leaves_nothing_behind(path, tmp_path, monkeypatch, 
     outputs = [out for cell in notebook.cells for out in cell.get("outputs", [])]
     stored = nbformat.read(path, as_version=4).cells
     assert [has_figure(cell) for cell in notebook.cells] == [has_figure(cell) for cell in stored]
-    assert sum(has_figure(cell) for cell in stored) >= 2
+    assert sum(has_figure(cell) for cell in stored) >= FIGURES.get(path.stem, 5)
     said = [out.text for out in outputs if out.get("name") == "stderr"]
     assert [text for text in said if "Warning" in text] == []
     assert list(tmp_path.iterdir()) == []
