@@ -98,7 +98,7 @@ def test_help_follows_the_options_of_the_command_line(script, tmp_path):
 
 def test_help_of_a_benchmark_lists_options_and_comments_of_the_package(script, tmp_path):
     reported = " ".join(script("soak", "--help", cwd=tmp_path).out.split())
-    assert "model cnn, fcnn, fcnn_paper, gnn, pod, unrolled*" in reported
+    assert "model cnn, fcnn*, fcnn_paper, gnn, pod, unrolled" in reported
     assert "# learning rate [-]" in reported
     ended = script("soak", "model=fcm", cwd=tmp_path)
     assert "Could not find 'model/fcm'" in ended.err
