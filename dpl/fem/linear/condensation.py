@@ -27,7 +27,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
-from dpl.fem.linear.condensed_loops import condensed_solves, round_rows, wide
+from dpl.fem.linear.condensed_loops import LANES, ROWS, condensed_solves, high, round_rows, wide
 from dpl.fem.linear.interface import SingularMatrix
 
 Integers = NDArray[np.int64]
@@ -94,15 +94,16 @@ class Condensed(NamedTuple):
     """Blocks of P matrices with the same fronts, children before their parents.
 
     A row of the table has the first and last position of the pivots among the unknowns, the last
-    position of the boundary, and the position of the blocks among the values. Rows of blocks are
-    filled with zeros to a length that loops like, see `wide`. The entries are values times factors
-    of their row and column.
+    position of the boundary, and the position of the blocks among the values. Unknowns are numbered
+    as they are eliminated, so that pivots follow each other. Blocks are filled with zeros to whole
+    tiles, see `tiled`. The entries are values times factors of their row and column.
     """
 
     table: Integers  # (S, 4)
-    unknowns: Integers  # pivots and boundary of one front after the other, (T,)
+    order: NDArray[np.uint32]  # equation of each unknown, (n,)
+    unknowns: NDArray[np.uint32]  # pivots and boundary of one front after the other, (T,)
     heights: Integers  # 0 without children, else one more than the largest of theirs, (S,)
-    values: NDArray[Any]  # F_II^-T and X of one front after the other, row by row, (P, V)
+    values: NDArray[Any]  # F_II^-T and X of one front after the other, tiled, (P, V)
     factors: NDArray[Any]  # of rows of F_II^-T, rows of X, and columns, by unknowns, (P, 3, T)
 
     @property
@@ -116,11 +117,31 @@ class Condensed(NamedTuple):
         of_inverse, of_coupling, columns = self.factors[p, :, first:last]
         count, found = middle - first, []
         for rows, own in ((of_inverse, columns[:count]), (of_coupling, columns[count:])):
-            width = wide(len(own))
-            block = self.values[p, place : place + count * width].reshape(count, width)
-            found.append(rows[:count, None] * block[:, : len(own)] * own)
-            place += count * width
+            end = place + high(count) * wide(len(own))
+            block = untiled(self.values[p, place:end], count, len(own))
+            found.append(rows[:count, None] * block * own)
+            place = end
         return found[0].T, found[1]
+
+
+def tiled(block: NDArray[Any]) -> NDArray[Any]:
+    """Return the entries of blocks (..., I, J) in the order in which loops read them, (..., V).
+
+    Tiles of `ROWS` rows and `LANES` columns follow each other, those of the same rows first.
+    """
+    *batch, count, length = block.shape
+    tall, long = high(count), wide(length)
+    filled = np.zeros((*batch, tall, long), block.dtype)
+    filled[..., :count, :length] = block
+    tiles = filled.reshape(*batch, tall // ROWS, ROWS, long // LANES, LANES).swapaxes(-3, -2)
+    return tiles.reshape(*batch, tall * long)
+
+
+def untiled(values: NDArray[Any], count: int, length: int) -> NDArray[Any]:
+    """Return the block (I, J) of values of `tiled`, (V,)."""
+    tall, long = high(count), wide(length)
+    tiles = values.reshape(tall // ROWS, long // LANES, ROWS, LANES).swapaxes(1, 2)
+    return tiles.reshape(tall, long)[:count, :length]
 
 
 def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Condensed:
@@ -168,13 +189,13 @@ def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Cond
         table.append((first, first + count, first + len(both), place))
         unknowns.append(both)
         for block in (inverse, X):
-            filled = np.zeros((len(F), count, wide(block.shape[2])))
-            filled[..., : block.shape[2]] = block
-            blocks.append(filled.reshape(len(F), -1))
+            blocks.append(tiled(block))
             place += blocks[-1].shape[1]
         first += len(both)
     factors = np.ones((len(matrices), 3, first))
-    arrays = np.array(table), np.concatenate(unknowns), heights
+    order = of_nodes(np.argsort(rank))
+    found = np.argsort(order)[np.concatenate(unknowns)].astype(np.uint32)
+    arrays = np.array(table), order.astype(np.uint32), found, heights
     return Condensed(*arrays, np.concatenate(blocks, axis=1), factors)
 
 
@@ -190,11 +211,11 @@ def rounded(blocks: Condensed, forces: NDArray[np.float64] | None = None) -> Con
     errors of the entries before).
     """
     values = np.zeros(blocks.values.shape, np.int16)
-    factors, size = np.ones(blocks.factors.shape, np.float32), len(np.unique(blocks.unknowns))
+    factors, size = np.ones(blocks.factors.shape, np.float32), len(blocks.order)
     for p in range(len(values)):
-        right = np.random.default_rng(1).standard_normal((size, TESTS))
+        right = np.random.default_rng(1).standard_normal((size, TESTS))[blocks.order]
         if forces is not None:
-            right = np.concatenate([right, forces[:, p].T], axis=1)
+            right = np.concatenate([right, forces[:, p, blocks.order].T], axis=1)
         solutions, acting = np.zeros_like(right), []
         for k, (first, middle, last, _) in enumerate(blocks.table.tolist()):
             pivots, boundary = blocks.unknowns[first:middle], blocks.unknowns[middle:last]
@@ -217,8 +238,8 @@ def rounded(blocks: Condensed, forces: NDArray[np.float64] | None = None) -> Con
                     found, rows, columns = found.T, columns, rows
                 factors[p, n, first:middle] = rows
                 factors[p, 2, slice(middle, last) if n else slice(first, middle)] = columns
-                end = place + count * wide(len(columns))
-                values[p, place:end].reshape(count, -1)[:, : len(columns)] = found
+                end = place + high(count) * wide(len(columns))
+                values[p, place:end] = tiled(found)
                 place = end
     return blocks._replace(values=values, factors=factors)
 
@@ -242,8 +263,9 @@ def _scales(block: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
 def condensed_solutions(blocks: Condensed, forces: NDArray[Any]) -> NDArray[Any]:
     """Return the solutions of one force for each of P matrices, (P, n) each, in their dtype."""
     solutions = np.empty(forces.shape, blocks.dtype)
-    table, unknowns, _, values, factors = blocks
-    condensed_solves(table, unknowns, values, factors, forces.astype(blocks.dtype), solutions)
+    table, order, unknowns, _, values, factors = blocks
+    forces = np.ascontiguousarray(forces, blocks.dtype)
+    condensed_solves(table, order, unknowns, values, factors, forces, solutions)
     return solutions
 
 
@@ -257,10 +279,10 @@ def add_inverses(
     inverse is (L^-1)^T D^-1 L^-1, so that only the forward pass is made, for all columns at once
     and in the dtype of the blocks.
     """
-    size = len(np.unique(blocks.unknowns))
+    places = np.argsort(blocks.order)[unknowns]
     for p, (own, weight) in enumerate(zip(signs, weights, strict=True)):
-        forces = np.zeros((size, len(unknowns)), blocks.dtype)
-        forces[unknowns, np.arange(len(unknowns))] = own
+        forces = np.zeros((len(blocks.order), len(places)), blocks.dtype)
+        forces[places, np.arange(len(places))] = own
         for k, (first, middle, last, _) in enumerate(blocks.table.tolist()):
             pivots, boundary = blocks.unknowns[first:middle], blocks.unknowns[middle:last]
             acting = np.flatnonzero(forces[pivots].any(axis=0))
@@ -291,9 +313,10 @@ class Layers(NamedTuple):
 
 def condensed_layers(blocks: Condensed, device: torch.device | str) -> Layers:
     """Return the blocks on a device, in their dtype."""
-    table, unknowns, heights, values, _ = blocks
+    table, order, numbers, heights, values, _ = blocks
+    unknowns = order[numbers].astype(np.int64)
     run = run_length(unknowns, table[:, 1], table[:, 2])
-    size, widths = len(np.unique(unknowns)), np.diff(table[:, :3])  # numbers of pivots, boundary
+    size, widths = len(order), np.diff(table[:, :3])  # numbers of pivots, boundary
     kinds = np.stack([heights, np.rint(np.log2(widths[:, 0])).astype(int)], axis=1)
     layers = []
     for kind in np.unique(kinds, axis=0):  # one height, similar numbers of pivots

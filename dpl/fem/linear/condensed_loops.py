@@ -1,15 +1,33 @@
-"""Compiled loops over dense blocks of condensed matrices, see `dpl.fem.linear.condensation`."""
+"""Compiled loops over dense blocks of condensed matrices, see `dpl.fem.linear.condensation`.
+
+Blocks are stored in tiles of `ROWS` rows and `LANES` columns in the order in which products read
+them, so that they are read from memory as one stream.
+"""
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from numba import float32, float64, int16, int64, njit, void
+from llvmlite import ir
+from numba import float32, float64, int16, int64, njit, types, uint32, void
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 LANES = 16  # entries of a row that a loop multiplies at once
+ROWS = 4  # rows that it multiplies at once
+FLAGS = ("contract", "reassoc", "nsz")  # fused multiply-adds and sums in any order
 
 
 @njit
 def wide(count):  # type: ignore[no-untyped-def]
     """Return a multiple of `LANES` of at least `count`."""
     return (count + LANES - 1) // LANES * LANES
+
+
+@njit
+def high(count):  # type: ignore[no-untyped-def]
+    """Return a multiple of `ROWS` of at least `count`."""
+    return (count + ROWS - 1) // ROWS * ROWS
 
 
 @njit(fastmath=True)
@@ -55,70 +73,160 @@ def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
         i += 1
 
 
+def _vectors(
+    context: Any, builder: Any, kinds: Any, values: Any, place: Any
+) -> tuple[Any, Callable[[Any, Any, Any], Any], Callable[[Any], list[Any]]]:
+    """Return the type of `LANES` sums, and functions that point to sums and read rows of a tile."""
+    sums = ir.VectorType(context.get_value_type(kinds[1].dtype), LANES)
+    numbers = ir.VectorType(context.get_value_type(kinds[0].dtype), LANES)
+    convert = builder.sitofp if kinds[0].dtype == int16 else builder.bitcast
+
+    def pointer(kind: Any, array: Any, position: Any, vector: Any = sums) -> Any:
+        data = context.make_array(kind)(context, builder, array).data
+        return builder.bitcast(builder.gep(data, [position]), vector.as_pointer())
+
+    def tile(column: Any) -> list[Any]:
+        first = builder.add(place, builder.mul(column, column.type(ROWS)))
+        offsets = (builder.add(first, first.type(LANES * k)) for k in range(ROWS))
+        pointers = [pointer(kinds[0], values, one, numbers) for one in offsets]
+        width = kinds[0].dtype.bitwidth // 8
+        return [convert(builder.load(one, align=width), sums) for one in pointers]
+
+    return sums, pointer, tile
+
+
+@intrinsic
+def add_tiles(typing: Any, values: Any, place: Any, x: Any, first: Any, y: Any, width: Any) -> Any:
+    """Add x A to y[:width] for `ROWS` rows A of tiles and as many entries x from `first`."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kinds = signature.args[0], signature.args[2]
+        sums, pointer, tile = _vectors(context, builder, kinds, *args[:2])
+        align, lanes, factors = kinds[1].dtype.bitwidth // 8, ir.IntType(32), []
+        for k in range(ROWS):
+            at = builder.add(args[3], args[3].type(k))
+            number = builder.load(pointer(kinds[1], args[2], at, sums.element))
+            one = builder.insert_element(sums(ir.Undefined), number, lanes(0))
+            everywhere = ir.VectorType(lanes, LANES)([0] * LANES)
+            factors.append(builder.shuffle_vector(one, one, everywhere))
+        zero, step = args[5].type(0), args[5].type(LANES)
+        with cgutils.for_range_slice(builder, zero, args[5], step, intp=zero.type) as (column, _):
+            place = pointer(kinds[1], args[4], column)
+            total = builder.load(place, align=align)
+            for factor, row in zip(factors, tile(column), strict=True):
+                total = builder.fadd(total, builder.fmul(row, factor, flags=FLAGS), flags=FLAGS)
+            builder.store(total, place, align=align)
+        return context.get_dummy_value()
+
+    return types.void(values, types.intp, x, types.intp, y, types.intp), code
+
+
+@intrinsic
+def subtract_tiles(
+    typing: Any, values: Any, place: Any, x: Any, width: Any, y: Any, first: Any
+) -> Any:
+    """Subtract A x[:width] from `ROWS` entries of y from `first` for as many rows A of tiles."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kinds = signature.args[0], signature.args[2]
+        sums, pointer, tile = _vectors(context, builder, kinds, *args[:2])
+        align, nothing = kinds[1].dtype.bitwidth // 8, sums([0.0] * LANES)
+        totals = [cgutils.alloca_once_value(builder, nothing) for _ in range(ROWS)]
+        for total in totals:
+            builder.store(nothing, total)
+        zero, step = args[3].type(0), args[3].type(LANES)
+        with cgutils.for_range_slice(builder, zero, args[3], step, intp=zero.type) as (column, _):
+            factor = builder.load(pointer(kinds[1], args[2], column), align=align)
+            for total, row in zip(totals, tile(column), strict=True):
+                product = builder.fmul(row, factor, flags=FLAGS)
+                builder.store(builder.fadd(builder.load(total), product, flags=FLAGS), total)
+        kind, name = sums.element, f"llvm.vector.reduce.fadd.v{LANES}f{8 * align}"
+        whole = builder.module.declare_intrinsic(name, (), ir.FunctionType(kind, [kind, sums]))
+        for k, total in enumerate(totals):
+            at = builder.add(args[5], args[5].type(k))
+            place = pointer(kinds[1], args[4], at, kind)
+            found = builder.call(whole, [kind(0.0), builder.load(total)], fastmath=FLAGS)
+            builder.store(builder.fsub(builder.load(place), found), place)
+        return context.get_dummy_value()
+
+    return types.void(values, types.intp, x, types.intp, y, types.intp), code
+
+
 @njit(
     [
-        void(int64[:, ::1], int64[::1], A[:, ::1], x[:, :, ::1], x[:, ::1], x[:, ::1])
+        void(int64[:, ::1], uint32[::1], uint32[::1], A[:, ::1], x[:, :, ::1], x[:, ::1], x[:, ::1])
         for A, x in ((int16, float32), (float64, float64))
     ],
+    fastmath=set(FLAGS),
     nogil=True,
     cache=True,
 )
-def condensed_solves(table, unknowns, values, factors, forces, solutions):  # type: ignore[no-untyped-def]
+def condensed_solves(table, order, unknowns, values, factors, forces, solutions):  # type: ignore[no-untyped-def]
     """Set `solutions` (P, n) to those of P matrices, one force (P, n) each, of one type.
 
-    The forces are overwritten. See `Condensed` for the other arguments.
+    See `Condensed` for the other arguments.
     """
     most = 0  # numba compiles the methods of arrays for a second
     for s in range(len(table)):
         most = max(most, wide(table[s, 2] - table[s, 0]))
     own, row = np.empty(most, forces.dtype), np.empty(most, forces.dtype)
+    force, solution = np.empty(len(order), forces.dtype), np.empty(len(order), forces.dtype)
     for p in range(len(values)):
-        force, solution, is_loaded = forces[p], solutions[p], False
-        for i in range(len(force)):
-            is_loaded |= force[i] != 0.0
-        if not is_loaded:
-            solution[:] = 0.0
-            continue
-        of_inverse, of_coupling, columns = factors[p, 0], factors[p, 1], factors[p, 2]
+        for i in range(len(order)):
+            force[i] = forces[p, order[i]]
+        blocks, first_pivot = values[p], 0
         for s in range(len(table)):
             first, middle, last, place = table[s]
             count, is_loaded = middle - first, False
+            acting = force[first_pivot : first_pivot + count]
+            found = solution[first_pivot : first_pivot + count]
+            first_pivot += count
             for i in range(count):
-                own[i] = force[unknowns[first + i]]
-                is_loaded |= own[i] != 0.0
+                is_loaded |= acting[i] != 0.0
             if not is_loaded:
                 for i in range(count):
-                    solution[unknowns[first + i]] = 0.0
+                    found[i] = 0.0
                 continue
-            start = place + count * wide(count)
             for n in range(2):  # F_II^-1 f, then X^T f
                 begin, end = (middle, last) if n else (first, middle)
+                scales, columns = factors[p, n, first:middle], factors[p, 2, begin:end]
                 width = wide(end - begin)
-                here = start if n else place
-                block = values[p, here : here + count * width].reshape((count, width))
-                row[:width] = 0.0
                 for i in range(count):
-                    factor = of_coupling[first + i] if n else of_inverse[first + i]
-                    own[i] = factor * force[unknowns[first + i]]
-                add_product(own[:count], block, row[:width])
+                    own[i] = scales[i] * acting[i]
+                for i in range(count, high(count)):
+                    own[i] = 0.0
+                for j in range(width):
+                    row[j] = 0.0
+                for i in range(0, count, ROWS):
+                    add_tiles(blocks, place, own, i, row, width)
+                    place += ROWS * width
                 if n:
-                    for j in range(begin, end):
-                        force[unknowns[j]] -= columns[j] * row[j - begin]
+                    boundary = unknowns[begin:end]
+                    for j in range(len(boundary)):
+                        force[boundary[j]] -= columns[j] * row[j]
                 else:
-                    for j in range(begin, end):
-                        solution[unknowns[j]] = columns[j] * row[j - begin]
+                    for i in range(count):
+                        found[i] = columns[i] * row[i]
         for s in range(len(table) - 1, -1, -1):
             first, middle, last, place = table[s]
             count, width = middle - first, wide(last - middle)
-            start = place + count * wide(count)
-            block = values[p, start : start + count * width].reshape((count, width))
-            row[:width] = 0.0
-            for j in range(middle, last):
-                row[j - middle] = columns[j] * solution[unknowns[j]]
-            own[:count] = 0.0
-            subtract_product(block, row[:width], own[:count])
+            first_pivot -= count
+            place += high(count) * wide(count)
+            boundary, columns = unknowns[middle:last], factors[p, 2, middle:last]
+            for j in range(len(boundary)):
+                row[j] = columns[j] * solution[boundary[j]]
+            for j in range(len(boundary), width):
+                row[j] = 0.0
+            for i in range(high(count)):
+                own[i] = 0.0
+            for i in range(0, count, ROWS):
+                subtract_tiles(blocks, place, row, width, own, i)
+                place += ROWS * width
+            scales, found = factors[p, 1, first:middle], solution[first_pivot:]
             for i in range(count):
-                solution[unknowns[first + i]] += of_coupling[first + i] * own[i]
+                found[i] += scales[i] * own[i]
+        for i in range(len(order)):
+            solutions[p, order[i]] = solution[i]
 
 
 @njit(
