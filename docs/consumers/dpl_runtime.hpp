@@ -489,7 +489,7 @@ class File {
     at_ = content_.data() + 8, end_ = data_ = at_ + length;
     available_ = std::size_t(size) - 8 - std::size_t(length);
     read_header();
-    if (metadata("format") != "dpl runtime 2") fail("has another format than dpl runtime 2; export the run again");
+    if (metadata("format") != "dpl runtime 3") fail("has another format than dpl runtime 3; export the run again");
     const std::string stored = metadata("crc32"), key = "\"crc32\":\"";
     const auto place = std::search(content_.begin(), content_.begin() + 8 + std::ptrdiff_t(length), key.begin(), key.end());
     if (stored.size() != 8 || content_.end() - place < 24) fail("is damaged: it has no checksum");
@@ -654,8 +654,35 @@ class File {
 };
 
 // ---------------------------------------------------------------- K(0)^-1 by static condensation
+constexpr int ROWS = 4, LANES = 16;  // of a tile, see dpl.fem.linear.tiles
+inline std::int64_t high(std::int64_t count) { return (count + ROWS - 1) / ROWS * ROWS; }
+inline std::int64_t wide(std::int64_t count) { return (count + LANES - 1) / LANES * LANES; }
+template <class T, class Number>
+inline void add_tiles(const T* x, const Number* tile, std::int64_t rows, std::int64_t n, T* y) {  // y += x A
+  constexpr int lanes = sizeof(Sums<T>) / sizeof(T);
+  for (std::int64_t i = 0; i < rows; i += ROWS)
+    for (std::int64_t j = 0; j < n; j += LANES, tile += ROWS * LANES)
+      for (int l = 0; l < LANES; l += lanes) {
+        Sums<T> total = load_as<T>(y + j + l);
+        for (int k = 0; k < ROWS; ++k) total += x[i + k] * load_as<T>(tile + k * LANES + l);
+        store(y + j + l, total);
+      }
+}
+template <class T, class Number>
+inline void subtract_tiles(const Number* tile, const T* x, std::int64_t rows, std::int64_t n, T* y) {  // y -= A x
+  constexpr int lanes = sizeof(Sums<T>) / sizeof(T);
+  for (std::int64_t i = 0; i < rows; i += ROWS) {
+    Sums<T> totals[ROWS] = {};
+    for (std::int64_t j = 0; j < n; j += LANES, tile += ROWS * LANES)
+      for (int l = 0; l < LANES; l += lanes)
+        for (int k = 0; k < ROWS; ++k) totals[k] += load_as<T>(x + j + l) * load_as<T>(tile + k * LANES + l);
+    for (int k = 0; k < ROWS; ++k) y[i + k] -= sum<T>(totals[k]);
+  }
+}
+
 struct Condensed {  // dpl.fem.linear.condensation; one matrix for each of M parities
   std::vector<std::int64_t> table;  // (S, 4)
+  std::vector<std::int32_t> order;  // (n,)
   std::vector<std::int32_t> unknowns;  // (T,)
   std::vector<std::int16_t> values;    // (M, V), times
   std::vector<float> factors;          // of rows and columns (M, 3, T), or
@@ -663,37 +690,45 @@ struct Condensed {  // dpl.fem.linear.condensation; one matrix for each of M par
   std::size_t length = 0;              // V
   int most = 0;                        // largest length of the rows of a front
 
-  static std::int64_t wide(std::int64_t count) { return (count + 15) / 16 * 16; }  // length of rows, filled with zeros
-
   template <class Number, class T>
-  void solve(const Number* blocks, const T* of_inverse, T* force, T* solution, std::vector<T>& work) const {
+  void solve(const Number* blocks, const T* of_inverse, const T* forces, T* solutions, std::vector<T>& work) const {
     const T *of_coupling = of_inverse + unknowns.size(), *columns = of_coupling + unknowns.size();
-    work.resize(2 * std::size_t(most));
-    T *own = work.data(), *other = own + most;
+    const std::size_t n = order.size();
+    work.resize(2 * (n + std::size_t(most)));
+    T *force = work.data(), *solution = force + n, *own = solution + n, *other = own + most;
+    for (std::size_t i = 0; i < n; ++i) force[i] = forces[order[i]];
     const int fronts = int(table.size() / 4);
+    std::int64_t pivot = 0;  // first one of a front
     for (int s = 0; s < fronts; ++s) {
       const std::int64_t *row = table.data() + 4 * s, first = row[0], count = row[1] - first;
-      const std::int32_t* places = unknowns.data();
-      bool is_loaded = false;
-      for (std::int64_t i = first; i < row[1]; ++i) solution[places[i]] = 0, is_loaded = is_loaded || force[places[i]] != 0;
+      const T* acting = force + pivot;
+      T* found = solution + pivot;
+      pivot += count;
+      std::fill(found, found + count, T(0));
+      if (std::all_of(acting, acting + count, [](T x) { return x == 0; })) continue;
       const Number* block = blocks + row[3];
-      for (int k = 0; k < 2 && is_loaded; ++k) {  // F_II^-1 f, X^T f
-        const T* rows = k ? of_coupling : of_inverse;
-        const std::int64_t begin = row[k], end = row[k + 1], width = wide(end - begin);
-        for (std::int64_t i = 0; i < count; ++i) own[i] = rows[first + i] * force[places[first + i]];
-        std::fill(other, other + width, T(0));
-        add_product(own, block, int(count), int(width), other);
-        for (std::int64_t j = begin; j < end; ++j) (k ? force : solution)[places[j]] -= (k ? 1 : -1) * columns[j] * other[j - begin];
-        block += count * width;
+      for (int k = 0; k < 2; ++k) {  // F_II^-1 f, X^T f
+        const T* rows = (k ? of_coupling : of_inverse) + first;
+        const std::int64_t begin = row[k], length = row[k + 1] - begin;
+        for (std::int64_t i = 0; i < count; ++i) own[i] = rows[i] * acting[i];
+        std::fill(own + count, own + high(count), T(0)), std::fill(other, other + wide(length), T(0));
+        add_tiles(own, block, high(count), wide(length), other);
+        const std::int32_t* places = unknowns.data() + begin;
+        if (k) for (std::int64_t j = 0; j < length; ++j) force[places[j]] -= columns[begin + j] * other[j];
+        else for (std::int64_t j = 0; j < length; ++j) found[j] = columns[begin + j] * other[j];
+        block += high(count) * wide(length);
       }
     }
     for (int s = fronts - 1; s >= 0; --s) {
-      const std::int64_t *row = table.data() + 4 * s, first = row[0], count = row[1] - first, width = wide(row[2] - row[1]);
-      std::fill(own, own + count, T(0)), std::fill(other, other + width, T(0));
-      for (std::int64_t j = row[1]; j < row[2]; ++j) other[j - row[1]] = columns[j] * solution[unknowns[j]];
-      subtract_product(blocks + row[3] + count * wide(count), other, int(count), int(width), own);
-      for (std::int64_t i = 0; i < count; ++i) solution[unknowns[first + i]] += of_coupling[first + i] * own[i];
+      const std::int64_t *row = table.data() + 4 * s, first = row[0], count = row[1] - first, length = row[2] - row[1];
+      const std::int32_t* places = unknowns.data() + row[1];
+      std::fill(own, own + high(count), T(0)), std::fill(other, other + wide(length), T(0));
+      for (std::int64_t j = 0; j < length; ++j) other[j] = columns[row[1] + j] * solution[places[j]];
+      subtract_tiles(blocks + row[3] + high(count) * wide(count), other, high(count), wide(length), own);
+      pivot -= count;
+      for (std::int64_t i = 0; i < count; ++i) solution[pivot + i] += of_coupling[first + i] * own[i];
     }
+    for (std::size_t i = 0; i < n; ++i) solutions[order[i]] = solution[i];
   }
 };
 
@@ -826,6 +861,7 @@ class Simulator {
     file.check(file.size('l') == file.size('K') + 1, "limits");
     file.check(file.size('d') == 2 * file.size('b') && b_ % (9 * detail::L) == 0, "map_signs");
     condensed_.table = file.read<std::int64_t>("front_table", "S4");
+    condensed_.order = file.indices<int32_t>("front_order", "m", file.size('m'));
     condensed_.unknowns = file.indices<int32_t>("front_unknowns", "T", file.size('m'));
     if (file.is_float32("block_factors")) {
       condensed_.values = file.read<std::int16_t>("blocks", "MV"), condensed_.factors = file.read<float>("block_factors", "M3T");
@@ -834,13 +870,16 @@ class Simulator {
     }
     condensed_.length = file.size('V');
     const std::int64_t T = std::int64_t(file.size('T')), V = std::int64_t(file.size('V'));
+    std::int64_t pivots = 0;
     for (std::size_t s = 0; s < file.size('S'); ++s) {
       const std::int64_t* row = condensed_.table.data() + 4 * s;
       file.check(0 <= row[0] && row[0] <= row[1] && row[1] <= row[2] && row[2] <= T, "front_table");
-      const std::int64_t count = row[1] - row[0], width = condensed_.wide(count) + condensed_.wide(row[2] - row[1]);
-      file.check(0 <= row[3] && row[3] <= V && (width == 0 || count <= (V - row[3]) / width), "front_table");
+      const std::int64_t count = row[1] - row[0], width = detail::wide(count) + detail::wide(row[2] - row[1]);
+      file.check(0 <= row[3] && row[3] <= V && (width == 0 || detail::high(count) <= (V - row[3]) / width), "front_table");
+      pivots += count;
       condensed_.most = std::max(condensed_.most, int(width));
     }
+    file.check(pivots == m_, "front_table");
     error_factor_ = file.number("error_factor"), error_exponents_ = file.read<double>("error_exponents", "e");
     least_sizes_ = file.read<double>("least_sizes", "e");
     file.check(file.size('e') == file.size('K') + 2, "error_exponents");

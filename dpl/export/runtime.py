@@ -43,7 +43,7 @@ from dpl.system.files import atomic_write
 from dpl.training import TrainedSurrogate
 from dpl.version import ROOT, __version__
 
-FORMAT = "dpl runtime 2"
+FORMAT = "dpl runtime 3"
 FILE, SOURCES = "runtime.safetensors", ("dpl_runtime.hpp", "dpl_c.h", "dpl_c.cpp")
 # in a wheel inside the package, in a checkout in the documentation
 HOME = next(filter(Path.is_dir, [ROOT / "dpl" / "consumers"]), ROOT / "docs" / "consumers")
@@ -123,7 +123,7 @@ def _model(net: Unrolled) -> Arrays:
     orbits, own = arrays.orbits, arrays._asdict()
     del own["orbits"]
     law, inverse, _ = net._at(torch.zeros(1, 0))
-    table, unknowns, _, values, block_factors = linear.blocks
+    table, order, unknowns, _, values, block_factors = linear.blocks
     factors = np.append(linear.terms.factors(net.scene.problem.material)[0].numpy(), 1.0)
     return {
         **orbits._asdict(),
@@ -134,6 +134,7 @@ def _model(net: Unrolled) -> Arrays:
         "reduced_inverse": inverse,
         "law_samples": law[1],
         "front_table": table,
+        "front_order": order.astype(np.int32),
         "front_unknowns": unknowns.astype(np.int32),
         "blocks": values,
         "block_factors": block_factors,

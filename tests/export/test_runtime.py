@@ -353,6 +353,7 @@ def test_damaged_files_end_in_one_line(written, programs, tmp_path):
         ("dofs", lambda a: a - 10_000),
         ("columns", lambda a: a + 1000),
         ("front_unknowns", lambda a: a + 10_000),
+        ("front_order", lambda a: a + 10_000),
         ("front_table", lambda a: a + np.array([0, 0, 0, 10_000_000])),
         ("front_table", lambda a: a[:, [1, 0, 2, 3]]),
         ("load_nodes", lambda a: -a),

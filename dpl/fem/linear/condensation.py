@@ -27,8 +27,9 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
-from dpl.fem.linear.condensed_loops import LANES, ROWS, condensed_solves, high, round_rows, wide
+from dpl.fem.linear.condensed_loops import condensed_solves, round_rows
 from dpl.fem.linear.interface import SingularMatrix
+from dpl.fem.linear.tiles import high, tiled, untiled, wide
 
 Integers = NDArray[np.int64]
 
@@ -122,26 +123,6 @@ class Condensed(NamedTuple):
             found.append(rows[:count, None] * block * own)
             place = end
         return found[0].T, found[1]
-
-
-def tiled(block: NDArray[Any]) -> NDArray[Any]:
-    """Return the entries of blocks (..., I, J) in the order in which loops read them, (..., V).
-
-    Tiles of `ROWS` rows and `LANES` columns follow each other, those of the same rows first.
-    """
-    *batch, count, length = block.shape
-    tall, long = high(count), wide(length)
-    filled = np.zeros((*batch, tall, long), block.dtype)
-    filled[..., :count, :length] = block
-    tiles = filled.reshape(*batch, tall // ROWS, ROWS, long // LANES, LANES).swapaxes(-3, -2)
-    return tiles.reshape(*batch, tall * long)
-
-
-def untiled(values: NDArray[Any], count: int, length: int) -> NDArray[Any]:
-    """Return the block (I, J) of values of `tiled`, (V,)."""
-    tall, long = high(count), wide(length)
-    tiles = values.reshape(tall // ROWS, long // LANES, ROWS, LANES).swapaxes(1, 2)
-    return tiles.reshape(tall, long)[:count, :length]
 
 
 def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Condensed:

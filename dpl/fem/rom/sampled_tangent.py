@@ -1,6 +1,7 @@
 """Tangent of a body in a subspace, its nonlinear part sampled at one point of each chosen cell."""
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,6 +46,7 @@ class SampledTangent:
         white = vectors @ scale
         self.scale, self._white = scale.numpy(), white[problem.free].numpy()
         self.rows: Single = white.flatten(0, 1).float().numpy()
+        self._last: tuple[Material, tuple[Material, tuple[Any, ...] | None]] | None = None
         if cubature is not None:
             self._cells = cubature.cells
             sampled = ReducedMesh(problem, white, self._cells, cubature.weights.double())
@@ -81,17 +83,27 @@ class SampledTangent:
 
     def _moduli_change_product(self, problem: Problem, displacement: Tensor) -> Single:
         """Return w vol (A(H) - A(0)) G, (C, D D, R)."""
-        law = one_law(problem.material.of_cells(self._cells).centred())
-        if (form := law.compiled_form) is None:
+        law, compiled = self._law(problem)
+        if compiled is None:
             return self._reference_product(law, displacement)
         out = np.empty_like(self._basis)
         u = displacement.contiguous().numpy()
-        call_compiled(
-            element_loops.moduli_change_product,
-            *(Law.of(form, element_loops.SOURCES), constants_of(law)[0]),
-            *(float(law.finite), u, self._nodes, self._dN, self._dV, self._basis, out),
-        )
+        arrays = u, self._nodes, self._dN, self._dV, self._basis, out
+        call_compiled(element_loops.moduli_change_product, *compiled, *arrays)
         return out
+
+    def _law(self, problem: Problem) -> tuple[Material, tuple[Any, ...] | None]:
+        """Return the law of the cells, the last one kept, and as first arguments of the loop."""
+        last = self._last  # read once: another thread may replace it
+        if last and last[0] is problem.material:
+            return last[1]
+        law = one_law(problem.material.of_cells(self._cells).centred())
+        arguments, form = None, law.compiled_form
+        if form is not None:
+            key = Law.of(form, element_loops.SOURCES)
+            arguments = key, constants_of(law)[0], float(law.finite)
+        self._last = problem.material, (law, arguments)
+        return law, arguments
 
     def _reference_product(self, law: Material, displacement: Tensor) -> Single:
         """Return the same by tensor operations, for laws without compiled loops."""

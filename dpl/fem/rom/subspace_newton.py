@@ -219,8 +219,7 @@ class SubspaceNewton:
         """Return M s_0 in coordinates of W, (R,), of the first correction (R,)."""
         if self.gains is None:
             return np.zeros_like(y)
-        scale = self.tangent.scale
-        shift: Array = solve_triangular(scale, self.gains.numpy() @ (scale @ y))
+        shift: Array = self._gains @ y
         return shift * min(1.0, MAX_SHIFT / max(self._relative(shift, displacement), 1e-300))
 
     def _step(
@@ -260,6 +259,13 @@ class SubspaceNewton:
         """Return ||s|| / ||u||; zero if both are, infinite if only u is zero."""
         size, whole = self._norm(y), float(dnrm2(displacement.flatten().numpy()))
         return size / whole if whole else math.inf if size else 0.0
+
+    @cached_property
+    def _gains(self) -> Array:
+        """M in coordinates of W, (R, R)."""
+        assert self.gains is not None
+        scale = self.tangent.scale
+        return solve_triangular(scale, self.gains.numpy() @ scale)
 
     @cached_property
     def tangent(self) -> SampledTangent:

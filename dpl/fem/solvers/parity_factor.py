@@ -200,8 +200,8 @@ class CondensedBody:
         weights = self.terms.weights(factors)[0].numpy()
         used, count = weights.nonzero()[0], len(self.form.parities.characters)
         own = slice(used[0] * count, (used[-1] + 1) * count)
-        values, factors = self.blocks.values[own], self.blocks.factors[own]
-        blocks = self.blocks._replace(values=values, factors=factors)
+        parts = {"values": self.blocks.values[own], "factors": self.blocks.factors[own]}
+        blocks = self.blocks._replace(**parts)
         return Inverse(blocks, weights[used, None, None].astype(blocks.dtype))
 
     def factor(self, law: Material) -> "ParityFactor":
