@@ -22,7 +22,7 @@ from dpl.fem.assembly.boundary_conditions import (
 )
 from dpl.fem.assembly.discretisation import Discretisation, geometry
 from dpl.fem.assembly.elements import QUADRATIC, basis_of, locking_warnings
-from dpl.fem.assembly.equilibrium import difference_norms, norms, relative_size
+from dpl.fem.assembly.equilibrium import norms, relative_residual
 from dpl.fem.assembly.follower_loads import NO_LOADS, FollowerLoad, FollowerLoads
 from dpl.fem.assembly.kernels import CompiledLoops
 from dpl.fem.assembly.recovery import Recovery
@@ -364,13 +364,12 @@ class Problem:
 
     def _measured(self, internal: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return `relative_residual_of` and the ||f|| that it is relative to, (B,) [-]."""
-        residual, load = difference_norms(internal, force, self._free_factors.to(force))
-        loads = [load]
+        loads = []
         if self.moved_supports:
             loads.append(norms(internal * (self.prescribed != 0)))
         if self.follower_loads:
             loads.append(norms(self.acting(self.force_at_rest.reshape(-1, *self.shape))))
-        return relative_size(residual, loads)
+        return relative_residual(internal, force, self._free_factors.to(force), loads)
 
     def acting(self, force: Tensor) -> Tensor:
         """Return a force (B, N, D) [-] at free degrees of freedom, where it has an effect.

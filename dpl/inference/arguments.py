@@ -58,7 +58,7 @@ def per_load(name: str, value: Any, count: int) -> Array:
         raise ValueError(f"{name}: {given}; give one number, or one for each load")
     if not np.isfinite(column).all():
         raise ValueError(f"{name}: a number is not finite")
-    return np.broadcast_to(column.reshape(-1), count).copy()
+    return column.reshape(-1) if column.size == count else np.full(count, column)
 
 
 def named_columns(name: str, value: Any, names: Sequence[str], count: int) -> Array:
@@ -99,8 +99,9 @@ def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
     low, high = scene.loads.moduli
     if young is None and low < high:
         raise ValueError(f"young: the scene has a range, {low:g} to {high:g} Pa; say which")
-    moduli = per_load("young", low if young is None else young, len(force))
-    if not (moduli > 0).all():
+    if young is None:
+        moduli = np.full(len(force), low)
+    elif not ((moduli := per_load("young", young, len(force))) > 0).all():
         raise ValueError("young: a modulus is not above 0 Pa")
     for modulus in moduli.tolist():
         scene.problem.check_modulus(modulus)

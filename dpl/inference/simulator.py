@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 
@@ -123,7 +124,8 @@ class Simulator:
             answers = []
             for single, guess, place in zip(load.unbatch(), guesses, places, strict=True):
                 begin = time.perf_counter() - shared
-                own = replace(request, begin=begin, products=self._products(place, request))
+                own = copy(request)  # `replace` would check the tolerances again
+                own.begin, own.products = begin, self._products(place, request)
                 best = self._solve(single, guess, place, own)
                 with own.durations.timed(FINISH):
                     best = self._with_error(single, best, own)

@@ -11,10 +11,10 @@ Source: OptiStruct 2020, Nonlinear Convergence Criteria (its relative error in l
 reactions due to specified displacements").
 """
 
+import math
 from collections.abc import Sequence
 from functools import reduce
 
-import numpy as np
 import torch
 from numba import float64, njit
 from numba.types import Array, UniTuple
@@ -26,29 +26,30 @@ SQUARES = 1e-280, 1e280  # sums of squares without under- or overflow
 FIELD = Array(float64, 1, "C", readonly=True)
 
 
-def relative_size(residual: Tensor, loads: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Return ||R|| over the largest of the norms of loads, and that norm, (B,) each [-].
+def relative_residual(
+    internal: Tensor, force: Tensor, factors: Tensor, others: Sequence[Tensor] = ()
+) -> tuple[Tensor, Tensor]:
+    """Return ||R|| over the largest norm of the loads, and that norm, (B,) each [-].
 
-    ||R|| is (B,), and the norms are (B or 1,). Without loads the result is ||R||. It is NaN for a
-    load that is not finite, and for one whose norm is below `FAINT`, since its residual cannot be
-    computed.
+    R = internal - force, (B, N, D), at degrees of freedom with a factor 1 of `factors` (N, D), not
+    at those with 0. The loads are the force and others, of norms (B or 1,). Without loads the
+    result is ||R||. It is NaN for a load that is not finite, and for one whose norm is below
+    `FAINT`, since its residual cannot be computed.
     """
-    size = reduce(torch.maximum, loads)  # NaN if an entry is
-    size = size + (size == 0).double()
+    if internal.device.type == "cpu" and not torch.compiler.is_compiling():
+        own = factors.flatten().numpy()
+        rows = (x.detach().contiguous().flatten(1).numpy() for x in (internal, force))
+        squares = [_squares(*pair, own) for pair in zip(*rows, strict=True)]
+        if all(SQUARES[0] <= x <= SQUARES[1] for pair in squares for x in pair):  # False for NaN
+            sizes = [math.sqrt(size) for _, size in squares]
+            if not others and min(sizes) >= FAINT:
+                ratios = [math.sqrt(x / size) for x, size in squares]
+                return force.new_tensor(ratios), force.new_tensor(sizes)
+    residual = norms(factors * (internal - force))
+    size = reduce(torch.maximum, [norms(factors * force), *others])  # NaN if an entry is
+    size = torch.where(size == 0, 1.0, size)
     size = size.masked_fill(~((size >= FAINT) & (size < torch.inf)), torch.nan)
     return residual / size, size
-
-
-def difference_norms(one: Tensor, other: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the norms (B,) of factors (N, D) times one - other and times other, (B, N, D)."""
-    if one.device.type == "cpu" and not torch.compiler.is_compiling():
-        rows = (x.detach().contiguous().flatten(1).numpy() for x in (one, other))
-        own = factors.flatten().numpy()
-        squares = np.array([_squares(*pair, own) for pair in zip(*rows, strict=True)])
-        if SQUARES[0] <= squares.min() <= squares.max() <= SQUARES[1]:  # False for NaN
-            first, second = torch.from_numpy(np.sqrt(squares)).unbind(1)
-            return first, second
-    return norms(factors * (one - other)), norms(factors * other)
 
 
 @njit([UniTuple(float64, 2)(FIELD, FIELD, FIELD)], fastmath={"reassoc", "contract"}, cache=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 Array = NDArray[np.float64]
 SHAPES, FORCE = (Typed(float64, dim, "C", readonly=True) for dim in (3, 2))
 LEAST_SQUARE = 1e-13  # singular value of the normal equations over the largest that counts [-]
+WELL = 1e-6  # part of a square that shapes before it leave, above which they are independent [-]
 EDGE = 1e-6  # of the largest size: a size that much below its range lies in it, due to rounding [-]
 FITS = 1e-6  # distance from a family up to which a force belongs to it [-]
 
@@ -55,6 +56,32 @@ def _loaded(shapes, force):  # type: ignore[no-untyped-def]
     return rows, products, largest
 
 
+@njit([Tuple((float64[:, ::1], float64[::1]))(float64[:, :])], cache=True)
+def _whitened(matrix):  # type: ignore[no-untyped-def]
+    """Return L^-T and ones with matrix = L L^T, (K, K) and (K,); zeros if it is ill-conditioned."""
+    K = len(matrix)
+    lower, inverse, ones = np.zeros((K, K)), np.zeros((K, K)), np.ones(K)
+    for j in range(K):
+        pivot = matrix[j, j]
+        for k in range(j):
+            pivot -= lower[j, k] * lower[j, k]
+        if not pivot > WELL * matrix[j, j]:
+            return inverse, np.zeros(K)
+        lower[j, j] = np.sqrt(pivot)
+        for i in range(j + 1, K):
+            lower[i, j] = matrix[i, j]
+            for k in range(j):
+                lower[i, j] -= lower[i, k] * lower[j, k]
+            lower[i, j] /= lower[j, j]
+    for j in range(K):  # columns of L^-1 are rows of L^-T
+        for i in range(j, K):
+            total = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                total -= lower[i, k] * inverse[j, k]
+            inverse[j, i] = total / lower[i, i]
+    return inverse, ones
+
+
 @njit(
     [Tuple((float64[::1], float64))(float64[:, ::1], *[float64[:, :]] * 2, float64[:])], cache=True
 )
@@ -92,8 +119,10 @@ def fit(
     rows, products, unit = _loaded(shapes, force)
     if unit == 0:
         return np.zeros(shapes.shape[-1]), 0.0
-    sizes, axes = np.linalg.eigh(products[:-1, :-1])
-    inverse = np.where(sizes > LEAST_SQUARE * sizes[-1], 1 / np.maximum(sizes, 1e-300), 0.0)
+    axes, inverse = _whitened(products[:-1, :-1])
+    if not inverse[0]:
+        sizes, axes = np.linalg.eigh(products[:-1, :-1])
+        inverse = np.where(sizes > LEAST_SQUARE * sizes[-1], 1 / np.maximum(sizes, 1e-300), 0.0)
     q, residual = _fitted(rows, products, axes, inverse)
     q *= unit
     if inverse.all() or low <= q.min() <= q.max() <= high:

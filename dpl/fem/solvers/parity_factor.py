@@ -142,6 +142,8 @@ class Inverse(NamedTuple):
 
     def apply(self, parts: NDArray[Any]) -> NDArray[Any]:
         """Return the products with forces by parity, (M, m) each, in the type of the blocks."""
+        if len(self.weights) == 1:
+            return condensed_solutions(self.blocks, self.weights[0] * parts)
         forces = (self.weights * parts).reshape(-1, parts.shape[1])
         found = condensed_solutions(self.blocks, forces)
         return found.reshape(-1, *parts.shape).sum(axis=0)
