@@ -127,8 +127,8 @@ class Simulator:
                 own = copy(request)  # `replace` would check the tolerances again
                 own.begin, own.products = begin, self._products(place, request)
                 best = self._solve(single, guess, place, own)
+                best = self._with_error(single, best, own)
                 with own.durations.timed(FINISH):
-                    best = self._with_error(single, best, own)
                     state = best.state
                     if stability and state.converged and int(state.negative_pivots) < 0:
                         newton = self.scene.newton.with_parameters(single.parameters)
@@ -191,7 +191,7 @@ class Simulator:
                 last = self._with_error(load, last, request)
             if best is None or request.rank(last) <= request.rank(best):
                 best = last
-            if request.is_met(last) or request.over(stage):
+            if request.is_met(last) or request.over(*stage):
                 break
         assert best is not None
         assert last is not None
@@ -240,19 +240,21 @@ class Simulator:
 
     def _candidates(
         self, load: Load, guess: Guess, place: RangeCheck, request: Request
-    ) -> Iterator[tuple[Candidate, str]]:
-        """Yield the solutions of the methods, the cheapest first, and what would follow.
+    ) -> Iterator[tuple[Candidate, Sequence[str]]]:
+        """Yield the solutions of the methods, the cheapest first, and the stages that would follow.
 
         The hybrid continues from the prediction, or with `warm` from the last displacement, if that
         is near equilibrium. Otherwise Newton's method starts from rest, since its iterates from far
         seldom lead to a solution.
         """
         for first in self._predictions(load, guess, request):
-            yield first, "start"  # the last one is the best
+            is_known = math.isfinite(first.error_in_modes + first.error_outside)
+            following = ["start"] if is_known else ["start with estimate", "estimate"]
+            yield first, following  # the last one is the best
         if not request.is_more_than_prediction:
             return
         starts, durations = [first], request.durations
-        with durations.timed("start"):
+        with durations.timed(following[0]):
             if request.warm and self._before and torch.equal(self._before[0], load.parameters):
                 starts.append(self._evaluated("last", self._before[1], load, request))
             # a rough estimate suffices up to `FAR`
@@ -260,17 +262,17 @@ class Simulator:
             distances = [self._with_error(load, one, rough).known_error for one in starts]
         nearest = starts[distances.index(min(distances))].state
         start = nearest.displacement if min(distances) <= FAR else None
-        stage = "Newton" if start is None or not self.scene.is_compact else "iteration"
+        is_slow = start is None or not self.scene.is_compact
+        following = ["Newton" if is_slow else "iteration", "estimate"]  # the last of the result
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
             linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
-            yield self._evaluated("linear", linear, load, request), stage
-        elif request.over(stage):
+            yield self._evaluated("linear", linear, load, request), following
+        elif request.over(*following):
             return
 
         def newton_is_over() -> bool:  # called after the iterations without tangents
-            nonlocal stage
-            stage = "Newton"
-            return request.over(stage)
+            following[0] = "Newton"
+            return request.over(*following)
 
         tol = request.iteration_tol(self.scene)
         if start is None:
@@ -283,11 +285,12 @@ class Simulator:
         for state in states:
             if int(state.iterations):
                 now = time.perf_counter()
-                durations.add(stage, now - clock)
+                durations.add(following[0], now - clock)
                 clock = now
             elif not state.converged:  # the initial state, which has been evaluated
                 continue
-            yield Candidate("hybrid" if state.from_guess else "full Newton", state), stage
+            method = "hybrid" if state.from_guess else "full Newton"
+            yield Candidate(method, state), following
 
     def _predictions(self, load: Load, guess: Guess, request: Request) -> Iterator[Candidate]:
         """Yield the prediction after steps in the modes, then corrections of it where they help.
