@@ -122,6 +122,23 @@ def make_graph(make_scene, tmp_path_factory):
     return make_graph
 
 
+def test_displacements_with_inverted_elements_are_not_compared(make_graph, monkeypatch):
+    surrogate, path = make_graph("fcnn")
+    monkeypatch.setitem(comparison.AMPLITUDES, "large", 1e6)  # of random weights
+    kinds, inputs = sample_check_loads(surrogate.scene, 2)
+    own = [k for k, kind in enumerate(kinds) if kind in ("large", "in range")]
+    loads = [kinds[k] for k in own], {key: column[own] for key, column in inputs.items()}
+    session = OnnxSession(path)
+
+    def wrong(**given):
+        return {name: 1.1 * one for name, one in session(**given).items()}
+
+    wrong.outputs = session.outputs
+    rows = {row.kind: row.max_error for row in compare_outputs(surrogate, wrong, *loads)}
+    assert rows["large"] == 0
+    assert rows["in range"] == pytest.approx(0.1, rel=1e-3)
+
+
 @pytest.mark.parametrize("name", EVERY)
 def test_onnx_and_torch_agree_for_all_kinds_of_loads_and_batch_sizes(make_graph, name):
     """Small forces on a node have their linear solution, which no basis has to represent."""
