@@ -251,7 +251,7 @@ def fit_maps(
         in_modes: V, (n, R), the parity of each mode, (R,), and (V^T K(0) V)^-1 of `body`, (R, R).
         sets: Samples to fit to, and to choose by.
         copies, threads: Images of each sample in the first set, and threads, see `fit_map`.
-        cells, stages: Numbers of sample cells, and largest number of maps after the first.
+        cells, stages: Number of sample cells, and largest number of maps after the first.
     """
     problem, parities = linear.scene.problem, linear.form.parities
     modes, parity, inverse = in_modes
@@ -285,11 +285,11 @@ def fit_in_best_modes(
     linear: LinearResponse, terms: StiffnessTerms, both: tuple[Sample, Sample], *, rank: int,
     cells: int, stages: int,
 ) -> tuple[dict[str, Tensor], tuple[Tensor, Tensor], Tensor]:  # fmt: skip
-    """Fit the maps at all cells and at half as many, then in more modes, as long as that is better.
+    """Fit the maps in few modes, then in more, as long as that is better.
 
     `terms` are those of the body whose law is sampled. The samples are those to fit to, and those
-    to choose by. `rank`, `cells` and `stages` are the largest numbers of modes, of sample cells,
-    and of maps after the first.
+    to choose by. `rank` and `stages` are the largest numbers of modes, and of maps after the first;
+    `cells` is the number of sample cells, see `choose_cells`.
 
     Returns:
         The buffers of `dpl.models.Unrolled`, by name, of the fit with the smallest weighted mean
@@ -310,7 +310,7 @@ def fit_in_best_modes(
         turned = [_image(every.T, one, free).T for one in few]
         factors = terms.factors(terms.problem.reference.material)
 
-        def fit(count: int, cells: int) -> tuple[float, dict[str, Tensor], Tensor, float]:
+        def fit(count: int) -> tuple[float, dict[str, Tensor], Tensor, float]:
             modes = every[:, :count]
             stiffness = ReducedStiffness(reduced_terms(terms, modes), terms)
             # coordinates of images of the samples are those of the samples in images of the modes
@@ -333,11 +333,9 @@ def fit_in_best_modes(
         counts = [every.shape[1]]
         while counts[0] // 2 >= MIN_RANK:
             counts.insert(0, counts[0] // 2)
-        best = fit(counts[0], cells)
-        while cells > 1 and (other := fit(counts[0], cells // 2))[0] < best[0]:
-            best, cells = other, cells // 2
+        best = fit(counts[0])
         for count in counts[1:]:
-            if best[3] > INSIDE or not (other := fit(count, cells))[0] < best[0]:
+            if best[3] > INSIDE or not (other := fit(count))[0] < best[0]:
                 break
             best = other
         predicted = both[0].displacement[:STEPPED] - scatter_fields(best[2], free)

@@ -57,7 +57,7 @@ class Unrolled(StoredBuffers):
     solution, but the maps only ever see fields in the modes. c_lin and phi of a nearly
     incompressible body are those of a compressible one, see `sampled_terms`.
 
-    The numbers of modes, cells and maps are chosen by the error of the held-out samples. Each mode
+    The numbers of modes and maps are chosen by the error of the held-out samples. Each mode
     is even or odd under the reflections and half turns of the body (`dpl.fem.parity`), and the maps
     commute with these, so that the answer has these symmetries exactly. The fit uses the images of
     the samples under the others. The answer has them nearly.
@@ -130,7 +130,7 @@ class Unrolled(StoredBuffers):
         Args:
             scene: The scene to predict.
             rank: Largest number of modes of the displacement.
-            cells: Largest number of sample cells; a few more, if symmetries demand it.
+            cells: Number of sample cells; a few more, if symmetries demand it.
             stages: Largest number of iterations after the first map.
             symmetry: Find the symmetries of the body and build them into the answer.
         """
@@ -323,7 +323,7 @@ class Unrolled(StoredBuffers):
 
         Args:
             samples: Dimensionless samples to fit to, (S, N, D).
-            held_out: Samples by whose errors numbers of modes, cells and maps are chosen, and to
+            held_out: Samples by whose errors the numbers of modes and maps are chosen, and to
                 which the estimated errors are fitted.
 
         Raises:
