@@ -181,7 +181,7 @@ class Simulator:
         Its error is estimated if that decides.
         """
         scene, tol = self.scene, request.residual_tol(self.scene)
-        if not load.force.any() and not scene.problem.is_loaded_at_rest:
+        if not load.force.numpy().any() and not scene.problem.is_loaded_at_rest:
             rest = evaluate_solution(scene.problem, torch.zeros_like(load.force), load, tol)
             return Candidate("rest", rest, 0.0)
         best: Candidate | None = None
