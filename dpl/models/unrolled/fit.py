@@ -29,7 +29,7 @@ NOISE = 5e-7  # singular value over the largest below which a mode is rounding e
 STEPPED = 256  # samples to which the gains of a step are fitted
 LIMIT = 1.5  # factor on the largest ratio of corrections in the samples
 MIN_GAIN = 0.97  # largest ratio of held-out errors for which another map is worth its time
-INSIDE = 0.8  # part of held-out errors inside the modes above which more modes cannot pay
+INSIDE = 0.7  # part of held-out errors inside the modes above which more modes cannot pay
 
 
 def sampled_terms(terms: StiffnessTerms) -> StiffnessTerms:
