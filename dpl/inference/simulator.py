@@ -72,7 +72,7 @@ class Simulator:
         self.surrogate, self.newton, self.steps = surrogate.eval(), newton, steps
         self.scene: Scene = surrogate.scene
         if newton is not None:
-            newton.tangent  # noqa: B018  # built here, so that the first call is not slower
+            newton.prepare()  # here, so that the first call is not slower
         self._before: tuple[Tensor, Tensor] | None = None  # parameters, displacement
         self._durations = Durations()
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower

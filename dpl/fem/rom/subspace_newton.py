@@ -260,6 +260,12 @@ class SubspaceNewton:
         size, whole = self._norm(y), float(dnrm2(displacement.flatten().numpy()))
         return size / whole if whole else math.inf if size else 0.0
 
+    def prepare(self) -> None:
+        """Compute what all loads share and load the loops, so that the first one does not wait."""
+        rest = torch.zeros(self.problem.shape, dtype=torch.float64)
+        self.tangent.at(self.problem.reference, rest)
+        self._shift(np.zeros(self.vectors.shape[2]), rest)
+
     @cached_property
     def _gains(self) -> Array:
         """M in coordinates of W, (R, R)."""
