@@ -40,11 +40,10 @@ def relative_residual(
         own = factors.flatten().numpy()
         rows = (x.detach().contiguous().flatten(1).numpy() for x in (internal, force))
         squares = [_squares(*pair, own) for pair in zip(*rows, strict=True)]
-        if all(SQUARES[0] <= x <= SQUARES[1] for pair in squares for x in pair):  # False for NaN
-            sizes = [math.sqrt(size) for _, size in squares]
-            if not others and min(sizes) >= FAINT:
-                ratios = [math.sqrt(x / size) for x, size in squares]
-                return force.new_tensor(ratios), force.new_tensor(sizes)
+        is_usual = all(SQUARES[0] <= x <= SQUARES[1] for pair in squares for x in pair)
+        if is_usual and not others:  # no NaN, no square of a size that is too large or too small
+            ratios = [math.sqrt(x / size) for x, size in squares]
+            return force.new_tensor(ratios), force.new_tensor([math.sqrt(x) for _, x in squares])
     residual = norms(factors * (internal - force))
     size = reduce(torch.maximum, [norms(factors * force), *others])  # NaN if an entry is
     size = torch.where(size == 0, 1.0, size)

@@ -69,8 +69,14 @@ def condensed_solves(table, order, unknowns, values, factors, forces, solutions)
     own, row = np.empty(most, forces.dtype), np.empty(most, forces.dtype)
     force, solution = np.empty(len(order), forces.dtype), np.empty(len(order), forces.dtype)
     for p in range(len(values)):
+        is_loaded = False
         for i in range(len(order)):
             force[i] = forces[p, order[i]]
+            is_loaded |= force[i] != 0.0
+        if not is_loaded:
+            for i in range(len(order)):
+                solutions[p, i] = 0.0
+            continue
         blocks, first_pivot = values[p], 0
         for s in range(len(table)):
             first, middle, last, place = table[s]
