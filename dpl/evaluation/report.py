@@ -137,7 +137,7 @@ def evaluate(
     }
     if (within := surrogate.predictor.correction()) is not None:
         one = replace(within, tol=tight, max_iter=1, error_tol=LEAST_ERROR)
-        one.tangent  # noqa: B018  # built here, so that the first call is not slower
+        one.prepare()  # here, so that the first call is not slower
         predictions[ONE_STEP] = Corrected(surrogate.predict, one)
     paper = Hybrid(surrogate.predict, replace(_own(scene), tol=tight), "paper")
     solvers: dict[str, Solver] = {f"paper's hybrid to {power(tight)}": paper, **simulated}
