@@ -113,7 +113,7 @@ template <class T> DPL_INLINE T sum(Sums<T> v) {
 constexpr double SHIFT = 6755399441055744.0;  // 1.5 * 2^52: its last bits hold small integers
 constexpr double LN2_HIGH = 6.93147180369123816490e-01, LN2_LOW = 1.90821492927058770002e-10;
 DPL_INLINE V log1p(V x) {  // 2 atanh(f / (2 + f)) + k ln 2 with 1 + x = 2^k (1 + f)
-  const I y = bits<I>(1.0 + x), k = (y - 0x3fe6a09e667f3bcd) >> 52;
+  const I y = bits<I>(x > -1.0 ? 1.0 + x : all(1.0)), k = (y - 0x3fe6a09e667f3bcd) >> 52;
   const V whole = bits<V>(k + bits<I>(all(SHIFT))) - SHIFT, f = k == 0 ? x : bits<V>(y - (k << 52)) - 1.0;
   const V s = f / (2.0 + f), z = s * s;
   V series = all(2.0 / 21);
@@ -916,6 +916,7 @@ class Simulator {
     file.check(E > 0 && A > 0 && A <= detail::MOST_NODES && Q > 0, "cells");
     file.check(shapes == 1 || shapes == E, "dN");
     file.check(file.size('c') == std::size_t(law_.constants) && (file.size('h') == 1 || file.size('h') == E), "law_cells");
+    file.check(M_ > 0 && b_ > 0, "gradients");
     const std::size_t C = std::size_t(law_.constants) + 2, lanes = std::size_t(M_) * std::size_t(b_) / 9;
     file.check(file.size('C') == C && (file.size('i') == 1 || file.size('i') == lanes), "law_samples");
     cells_.count = int(E), cells_.nodes = int(A), cells_.points = int(Q), cells_.blocks = int((E + L - 1) / L);

@@ -42,7 +42,7 @@ class Symmetry(NamedTuple):
 
     def image(self, field: Tensor) -> Tensor:
         """Return the image (..., N, D) of a nodal field (..., N, D)."""
-        return field.index_select(-2, self.source) @ self.rotation.mT.to(field)
+        return field.index_select(-2, self.source.to(field.device)) @ self.rotation.mT.to(field)
 
 
 class SymmetryGroup(tuple[Symmetry, ...]):

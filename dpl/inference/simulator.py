@@ -248,7 +248,8 @@ class Simulator:
         seldom lead to a solution.
         """
         for first in self._predictions(load, guess, request):
-            is_known = math.isfinite(first.error_in_modes + first.error_outside)
+            known = first.error_in_modes + first.error_outside
+            is_known = first.error is not None or math.isfinite(known)
             following = ["start"] if is_known else ["start with estimate", "estimate"]
             yield first, following  # the last one is the best
         if not request.is_more_than_prediction:
@@ -338,10 +339,11 @@ class Simulator:
             return first._replace(error=guess.error)
         default = guess.error_outside if pays else ERROR
         wanted = default if request.error is None else request.error
+        following = ["step"] if math.isfinite(guess.error_outside) else ["step", "estimate"]
         begin = time.perf_counter()
         *_, state = self.newton.states(
             load, guess=guess.displacement, evaluation=first.state.evaluation, error_tol=wanted,
-            max_iter=self.steps - taken, is_over=lambda: request.over("step"),
+            max_iter=self.steps - taken, is_over=lambda: request.over(*following),
         )  # fmt: skip
         request.durations.add("step", (time.perf_counter() - begin) / (1 + state.iterations))
         if state.iterations:

@@ -386,6 +386,17 @@ def test_words_and_arrays_that_do_not_fit_end_in_one_line(
     assert line.startswith("error: " if change is None else "error: runtime file ")
 
 
+def test_a_file_without_sample_cells_ends_in_one_line(written, programs, tmp_path):
+    arrays = load_file(written[1])
+    first = "gradients", "rest", "entry_signs", "first_signs", "first_map"
+    for name in (*first, "map_signs", "maps"):
+        arrays[name] = arrays[name][..., :0].copy()
+    arrays["law_samples"] = arrays["law_samples"][:0].copy()
+    (path := tmp_path / FILE).write_bytes(with_checksum(arrays, WORDS))
+    (line,) = opened(programs, path)
+    assert line.startswith("error: runtime file ")
+
+
 def test_the_example_prints_error_and_time_of_each_frame(written, programs):
     command = [programs("loop"), written[1], "3", "0.5"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)

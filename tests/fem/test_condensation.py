@@ -100,7 +100,8 @@ def test_the_blocks_of_a_solid_are_smaller_than_its_inverse():
 
 def test_unknowns_of_a_node_stay_together():
     matrix, points = GRAPHS["three unknowns at each node"]
-    table, unknowns, *_ = condense([matrix], points)
+    blocks = condense([matrix], points)
+    table, unknowns = blocks.table, blocks.order[blocks.unknowns].astype(np.int64)
     assert run_length(unknowns, table[:, 1], table[:, 2]) == 3
     assert run_length(unknowns, table[:, 1] - 1) == 1
     assert run_length(unknowns + 1) == 1

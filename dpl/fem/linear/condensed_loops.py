@@ -2,8 +2,11 @@
 
 import numpy as np
 from numba import float32, float64, int16, int64, njit, uint32, void
+from numba.types import Array
 
 from dpl.fem.linear.tiles import FLAGS, ROWS, add_tiles, high, subtract_tiles, wide
+
+TABLE, NUMBERS = int64[:, ::1], uint32[::1]
 
 
 @njit(fastmath=True)
@@ -51,7 +54,7 @@ def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
 
 @njit(
     [
-        void(int64[:, ::1], uint32[::1], uint32[::1], A[:, ::1], x[:, :, ::1], x[:, ::1], x[:, ::1])
+        void(TABLE, *[NUMBERS] * 2, A[:, ::1], x[:, :, ::1], Array(x, 2, "C", True), x[:, ::1])
         for A, x in ((int16, float32), (float64, float64))
     ],
     fastmath=set(FLAGS),

@@ -14,6 +14,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+# numba's cache knows the file of a loop only: with these change `condensed_loops`, which calls them
 LANES = 16  # columns of a tile
 ROWS = 4  # rows of a tile
 FLAGS = ("contract", "reassoc", "nsz")  # fused multiply-adds and sums in any order

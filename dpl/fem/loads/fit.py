@@ -12,7 +12,7 @@ from torch import Tensor
 Array = NDArray[np.float64]
 SHAPES, FORCE = (Typed(float64, dim, "C", readonly=True) for dim in (3, 2))
 LEAST_SQUARE = 1e-13  # singular value of the normal equations over the largest that counts [-]
-WELL = 1e-6  # part of a square that shapes before it leave, above which they are independent [-]
+WELL = 1e-6  # pivot over the largest square above which shapes are independent [-]
 EDGE = 1e-6  # of the largest size: a size that much below its range lies in it, due to rounding [-]
 FITS = 1e-6  # distance from a family up to which a force belongs to it [-]
 
@@ -59,13 +59,15 @@ def _loaded(shapes, force):  # type: ignore[no-untyped-def]
 @njit([Tuple((float64[:, ::1], float64[::1]))(float64[:, :])], cache=True)
 def _whitened(matrix):  # type: ignore[no-untyped-def]
     """Return L^-T and ones with matrix = L L^T, (K, K) and (K,); zeros if it is ill-conditioned."""
-    K = len(matrix)
+    K, largest = len(matrix), 0.0
+    for j in range(K):
+        largest = max(largest, matrix[j, j])
     lower, inverse, ones = np.zeros((K, K)), np.zeros((K, K)), np.ones(K)
     for j in range(K):
         pivot = matrix[j, j]
         for k in range(j):
             pivot -= lower[j, k] * lower[j, k]
-        if not pivot > WELL * matrix[j, j]:
+        if not pivot > WELL * largest:
             return inverse, np.zeros(K)
         lower[j, j] = np.sqrt(pivot)
         for i in range(j + 1, K):
