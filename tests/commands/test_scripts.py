@@ -178,13 +178,13 @@ def test_ctrl_c_ends_training_with_130_and_leaves_no_process(streaming, members)
 @pytest.mark.slow
 def test_a_killed_worker_is_replaced_and_training_goes_on(streaming, members, tmp_path):
     process, workers = streaming
-    checkpoint = tmp_path / "r/checkpoints/last.ckpt"
+    ended, checkpoint = process.poll, tmp_path / "r/checkpoints/last.ckpt"
     for _ in range(4):  # some are killed while it waits, some while it learns
         before = workers()
         os.kill(before[0], signal.SIGKILL)
-        waited_for(lambda b=before: len(set(workers()) - set(b)) == 2 or process.poll() is not None)
+        assert waited_for(lambda b=before: len({*workers()} - {*b}) == 1 or ended() is not None)
         killed = time.time()
-        waited_for(lambda t=killed: checkpoint.stat().st_mtime > t or process.poll() is not None)
+        assert waited_for(lambda t=killed: checkpoint.stat().st_mtime > t or ended() is not None)
         assert process.poll() is None, process.communicate()[1][-2000:]
         time.sleep(0.3)
     os.killpg(process.pid, signal.SIGINT)
