@@ -654,7 +654,7 @@ class File {
 };
 
 // ---------------------------------------------------------------- K(0)^-1 by static condensation
-constexpr int ROWS = 4, LANES = 16;  // of a tile, see dpl.fem.linear.tiles
+constexpr int ROWS = 4, LANES = 16;  // of a tile, see dpl.fem.linear.tiles; -O2 does not unroll loops over rows
 inline std::int64_t high(std::int64_t count) { return (count + ROWS - 1) / ROWS * ROWS; }
 inline std::int64_t wide(std::int64_t count) { return (count + LANES - 1) / LANES * LANES; }
 template <class T, class Number>
@@ -663,20 +663,23 @@ inline void add_tiles(const T* x, const Number* tile, std::int64_t rows, std::in
   for (std::int64_t i = 0; i < rows; i += ROWS)
     for (std::int64_t j = 0; j < n; j += LANES, tile += ROWS * LANES)
       for (int l = 0; l < LANES; l += lanes) {
-        Sums<T> total = load_as<T>(y + j + l);
-        for (int k = 0; k < ROWS; ++k) total += x[i + k] * load_as<T>(tile + k * LANES + l);
-        store(y + j + l, total);
+        const Number *p = tile + l, *q = p + LANES, *r = q + LANES, *s = r + LANES;
+        store(y + j + l, load_as<T>(y + j + l) + (x[i] * load_as<T>(p) + x[i + 1] * load_as<T>(q)) +
+                             (x[i + 2] * load_as<T>(r) + x[i + 3] * load_as<T>(s)));
       }
 }
 template <class T, class Number>
 inline void subtract_tiles(const Number* tile, const T* x, std::int64_t rows, std::int64_t n, T* y) {  // y -= A x
   constexpr int lanes = sizeof(Sums<T>) / sizeof(T);
   for (std::int64_t i = 0; i < rows; i += ROWS) {
-    Sums<T> totals[ROWS] = {};
+    Sums<T> a = {}, b = {}, c = {}, d = {};
     for (std::int64_t j = 0; j < n; j += LANES, tile += ROWS * LANES)
-      for (int l = 0; l < LANES; l += lanes)
-        for (int k = 0; k < ROWS; ++k) totals[k] += load_as<T>(x + j + l) * load_as<T>(tile + k * LANES + l);
-    for (int k = 0; k < ROWS; ++k) y[i + k] -= sum<T>(totals[k]);
+      for (int l = 0; l < LANES; l += lanes) {
+        const Number *p = tile + l, *q = p + LANES, *r = q + LANES, *s = r + LANES;
+        const Sums<T> v = load_as<T>(x + j + l);
+        a += v * load_as<T>(p), b += v * load_as<T>(q), c += v * load_as<T>(r), d += v * load_as<T>(s);
+      }
+    y[i] -= sum<T>(a), y[i + 1] -= sum<T>(b), y[i + 2] -= sum<T>(c), y[i + 3] -= sum<T>(d);
   }
 }
 
