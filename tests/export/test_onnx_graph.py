@@ -139,6 +139,18 @@ def test_displacements_with_inverted_elements_are_not_compared(make_graph, monke
     assert rows["in range"] == pytest.approx(0.1, rel=1e-3)
 
 
+def test_a_graph_that_returns_nan_differs_everywhere(make_graph):
+    surrogate, path = make_graph("fcnn")
+    session = OnnxSession(path)
+
+    def broken(**given):
+        return {name: np.full_like(one, np.nan) for name, one in session(**given).items()}
+
+    broken.outputs = session.outputs
+    rows = compare_outputs(surrogate, broken, *sample_check_loads(surrogate.scene, 2))
+    assert all(row.max_error == np.inf for row in rows)
+
+
 @pytest.mark.parametrize("name", EVERY)
 def test_onnx_and_torch_agree_for_all_kinds_of_loads_and_batch_sizes(make_graph, name):
     """Small forces on a node have their linear solution, which no basis has to represent."""
