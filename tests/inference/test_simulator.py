@@ -16,7 +16,7 @@ import dpl
 import dpl.inference.request as request_module
 import dpl.inference.simulator as simulator_module
 from dpl.config import build
-from dpl.fem import solve
+from dpl.fem import SubspaceNewton, solve
 from dpl.inference import Hybrid, Simulator
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
@@ -211,6 +211,28 @@ def test_a_budget_ends_it_and_the_best_so_far_is_returned(scene, forces, clock):
     assert found[-1].converged
     ended = [answer for answer in found if not answer.converged]
     assert all(answer.residual <= found[0].residual for answer in ended)
+
+
+def test_steps_leave_time_for_the_estimate_of_a_load_out_of_range(scene, clock, monkeypatch):
+    sim = simulator_of(scene, 0.9, newton=newton_everywhere(scene))
+
+    def slow(function, milliseconds):
+        def call(*args, **options):
+            for _ in range(milliseconds):
+                next(clock)
+            return function(*args, **options)
+
+        return call
+
+    monkeypatch.setattr(
+        simulator_module, "estimate_error", slow(simulator_module.estimate_error, 15)
+    )
+    monkeypatch.setattr(SubspaceNewton, "_step", slow(SubspaceNewton._step, 6))
+    force = 3 * scene.loads.sample((0, 9), range(1)).force[0] * scene.force_unit * E
+    least = max(sim(force, budget_ms=1e-3).milliseconds for _ in range(3))
+    sim(force, budget_ms=1e6)  # times all stages
+    for budget in range(10, 60):
+        assert sim(force, budget_ms=budget).milliseconds < max(budget, least) + 2.5
 
 
 def test_several_loads_share_the_time_that_they_took(scene, forces, clock):
