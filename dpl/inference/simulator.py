@@ -186,12 +186,12 @@ class Simulator:
             return Candidate("rest", rest, 0.0)
         best: Candidate | None = None
         last: Candidate | None = None
-        for last, stage in self._candidates(load, guess, place, request):
+        for last, stages in self._candidates(load, guess, place, request):
             if request.error is not None:
                 last = self._with_error(load, last, request)
             if best is None or request.rank(last) <= request.rank(best):
                 best = last
-            if request.is_met(last) or request.over(*stage):
+            if request.is_met(last) or request.over(*stages):
                 break
         assert best is not None
         assert last is not None

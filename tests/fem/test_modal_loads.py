@@ -213,7 +213,7 @@ def test_a_mode_that_is_zero_at_the_loaded_node_has_no_part_in_its_force(monkeyp
     forces[0, node, axis] = forces[1, node, axis] = 1e-3
     forces[1, -1] = 1e-3
     found = loads.project(forces)
-    monkeypatch.setattr(fit, "_whitened", lambda matrix: (matrix, np.zeros(len(matrix))))
+    monkeypatch.setattr(fit, "_inverse_root", lambda matrix: (matrix, np.zeros(len(matrix))))
     for one, by_eigenvalues in zip(found, loads.project(forces), strict=True):
         assert_close(one, by_eigenvalues, rtol=1e-6, atol=1e-12)
 

@@ -57,7 +57,7 @@ def _loaded(shapes, force):  # type: ignore[no-untyped-def]
 
 
 @njit([Tuple((float64[:, ::1], float64[::1]))(float64[:, :])], cache=True)
-def _whitened(matrix):  # type: ignore[no-untyped-def]
+def _inverse_root(matrix):  # type: ignore[no-untyped-def]
     """Return L^-T and ones with matrix = L L^T, (K, K) and (K,); zeros if it is ill-conditioned."""
     K, largest = len(matrix), 0.0
     for j in range(K):
@@ -121,7 +121,7 @@ def fit(
     rows, products, unit = _loaded(shapes, force)
     if unit == 0:
         return np.zeros(shapes.shape[-1]), 0.0
-    axes, inverse = _whitened(products[:-1, :-1])
+    axes, inverse = _inverse_root(products[:-1, :-1])
     if not inverse[0]:
         sizes, axes = np.linalg.eigh(products[:-1, :-1])
         inverse = np.where(sizes > LEAST_SQUARE * sizes[-1], 1 / np.maximum(sizes, 1e-300), 0.0)
